@@ -7,7 +7,7 @@
 
 ``hallways`` puts the photos of both hallways of a floor into one folder. ``walk`` takes a dataset
 whose photos were taken in order, and whose poses lie in pieces 1000 units apart. Both make all
-models that there are: one of all photos, then one of those that are left, and so on. ``small``
+models that a build makes: one of all photos, then one of those that are left, and so on. ``small``
 compares the poses of few photos of the sample with the true ones, over settings that should not
 matter. ``speed`` builds a map of photos of the sample in a process of its own, without its poses,
 rigs and positions.
@@ -26,6 +26,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -39,10 +40,12 @@ from mapping.frames.anchor import align_poses
 from mapping.importers.dataset import write_imported
 from mapping.importers.images import read as read_photos
 from mapping.methods.extending import with_late_photos
+from mapping.methods.look_alikes import without_look_alikes
 from mapping.methods.matching import Matches, Verification, match_pairs
+from mapping.methods.pieces import models_beside
 from mapping.methods.scenes import find_pairs, make_scene
 from mapping.methods.sfm_settings import SfmSettings
-from mapping.methods.sparse_model import MAPPER_CONFIGS, SfmPhoto
+from mapping.methods.sparse_model import MAPPER_CONFIGS, SfmPhoto, SparseModel
 from mapping.methods.undoing import reconstruct_places
 from mapping.pairing import PairSettings
 from mapping.sample import write_sample
@@ -151,42 +154,53 @@ def matched(
 def all_models(root: Path, work: Path) -> tuple[int, list[Model]]:
     """Return how many photos a dataset has, and cam_from_world by name in each of its models."""
     scene = matched(root, work, SETTINGS)
-    models = []
-    left = list(range(len(scene.photos)))
-    while placed := _model_of(scene, left):
-        models.append({scene.photos[row].name: pose for row, pose in placed.items()})
-        left = [row for row in left if row not in placed]
-    return len(scene.photos), models
+    make = partial(_model_of, scene)
+    try:
+        largest = make(range(len(scene.photos)), scene.matches)
+    except InvalidInput as error:
+        typer.echo(f"no photo is in a model: {error.code}")
+        return len(scene.photos), []
+    largest = _with_late(scene, largest)
+    believed = without_look_alikes(scene.photos, scene.matches)
+    models = [largest, *models_beside(largest, believed, make)]
+    return len(scene.photos), [_poses(scene, model) for model in models]
 
 
-def _model_of(scene: Matched, rows: list[int]) -> dict[int, Pose]:
-    """Return the poses of the largest model of some photos; nothing without one."""
-    number = {row: order for order, row in enumerate(rows)}
-    among = [
-        Matches(number[pair.first], number[pair.second], pair.rows)
-        for pair in scene.matches
-        if pair.first in number and pair.second in number
-    ]
-    some = [scene.photos[row] for row in rows]
-
-    def describe(row: int) -> NDArray[np.int8]:
-        return scene.looks[rows[row]]
-
+def _model_of(scene: Matched, rows: Sequence[int], matches: Sequence[Matches]) -> SparseModel:
+    """Return the largest model of some photos; raise InvalidInput without one."""
     with tempfile.TemporaryDirectory() as folder:
-        try:
-            model = reconstruct_places(
-                some, describe, {}, among, CONFIG, (), Path(folder), lambda *_: None
-            )
-            if not model.undone:
-                model = with_late_photos(
-                    some, describe, among, model, CONFIG, Path(folder), lambda *_: None
-                )
-        except InvalidInput as error:
-            typer.echo(f"{len(rows)} photos are in no model: {error.code}")
-            return {}
+        return reconstruct_places(
+            [scene.photos[row] for row in rows],
+            lambda row: scene.looks[rows[row]],
+            {},
+            matches,
+            CONFIG,
+            (),
+            Path(folder),
+            lambda *_: None,
+        )
+
+
+def _with_late(scene: Matched, model: SparseModel) -> SparseModel:
+    """Return a model with the photos that find a place in it late."""
+    if model.undone or None not in model.views:
+        return model
+    with tempfile.TemporaryDirectory() as folder:
+        return with_late_photos(
+            scene.photos,
+            scene.looks.__getitem__,
+            scene.matches,
+            model,
+            CONFIG,
+            Path(folder),
+            lambda *_: None,
+        )
+
+
+def _poses(scene: Matched, model: SparseModel) -> Model:
     return {
-        row: view.cam_from_world
-        for row, view in zip(rows, model.views, strict=True)
+        photo.name: view.cam_from_world
+        for photo, view in zip(scene.photos, model.views, strict=True)
         if view is not None
     }
 
@@ -265,8 +279,10 @@ def small(work: WorkOption = Path(".bench/joining/small")) -> None:
             global_features=("localvlad",),
             max_keypoints=max_keypoints,
         )
-        placed = _model_of(scene, list(range(len(scene.photos))))
-        model = {scene.photos[row].name: pose for row, pose in placed.items()}
+        try:
+            model = _poses(scene, _model_of(scene, range(len(scene.photos)), scene.matches))
+        except InvalidInput:
+            model = {}
         errors = 100 * np.array(_distances(model, truth) if len(model) >= 3 else [np.nan])
         typer.echo(
             f"{folder.name}, {features} {max_keypoints}, {top_k} a photo: {len(model)} placed, "

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from mapping.build.build import build_map
+from mapping.build.pieces import pieces_of
 from mapping.build.settings import BuildSettings
 from mapping.maps.sets import publish_set
 from mapping.methods.sfm_settings import SfmSettings
@@ -106,9 +107,15 @@ def make_missing(places: Places, needed: set[str], tell: Callable[[str], None]) 
             build_map(replace(made, **settings), lambda *_: None)
     if FLOORS in needed - there:
         tell(f"making the set {FLOORS}")
+        # Videos without poses may have become several maps.
+        refs = [
+            ref
+            for map_id in (*FLOOR_11, *VIDEOS)
+            for ref in (map_id, *pieces_of(places.store.open(map_id)))
+        ]
         tiles = [
-            (map_id, Similarity(1.0, np.eye(3), np.array([APART * i, 0.0, 0.0])))
-            for i, map_id in enumerate((*FLOOR_11, *VIDEOS))
+            (ref, Similarity(1.0, np.eye(3), np.array([APART * i, 0.0, 0.0])))
+            for i, ref in enumerate(refs)
         ]
         publish_set(places.store, FLOORS, tiles, lambda *_: None)
 

@@ -8,8 +8,19 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from pydantic import JsonValue
+
 from mapping.build.checks import check_settings, refuse_early
 from mapping.build.content import build_content
+from mapping.build.pieces import (
+    PIECES,
+    WrittenMap,
+    ids_of_pieces,
+    note_of_largest,
+    note_of_piece,
+    publish_pieces,
+    refuse_long_id,
+)
 from mapping.build.settings import BuildSettings
 from mapping.cluster.executors import Executor, open_executor
 from mapping.cluster.stage_timings import Costs, wrote
@@ -24,7 +35,7 @@ from mapping.cluster.workers import one_thread_here
 from mapping.methods.known_model import landmarks_from_reconstruction
 from mapping.methods.rgbd import landmarks_from_depth
 from mapping.methods.sfm import landmarks_from_matches
-from mapping.own_test.publishing import Examine, publish_content
+from mapping.own_test.publishing import Examine, write_content
 from mapping.pairing import write_pairs
 from mapping.progress import Progress, one_step
 from mapping.stages.colours import landmark_colours
@@ -42,7 +53,7 @@ from mapping.stages.previews import keep_photos
 from mapping.stages.publishing import PAIRS
 from mapping.stages.resolution import at_one_resolution
 from mapping.stages.work_folder import WorkFolder, exclusive
-from visloc.archive import GlobalFeatures, MapContent, MapStore
+from visloc.archive import GlobalFeatures, MapStore
 from visloc.errors import refuse
 from visloc.features.backends.choice import choose_inference
 from visloc.features.local.readymade import is_ready_made
@@ -62,6 +73,9 @@ def build_map(
 ) -> Path:
     """Build a map and publish it, as the current version unless its own test speaks against it.
 
+    Photos without poses may fall apart into pieces. Each is published as a map of its own
+    (``mapping.build.pieces``).
+
     If it is killed, the same call finds its finished work again. The version that was current
     before stays current until the new one is complete and verified.
 
@@ -73,7 +87,7 @@ def build_map(
         examine: returns doubts about the map beyond those of its own test.
 
     Returns:
-        The folder of the new version; for maps at a URL, of the local copy.
+        The folder of the new version, of the largest piece; for maps at a URL, of the local copy.
 
     Raises:
         Conflict: ``map.exists`` without ``force``; ``build.running``.
@@ -84,6 +98,8 @@ def build_map(
         # Chosen for this machine; otherwise each machine of a cluster would choose for itself.
         settings = replace(settings, inference=choose_inference(settings.inference))
     check_settings(settings)
+    if settings.sfm.estimate_poses:
+        refuse_long_id(settings.map_id)
     store = open_store(settings.maps_dir, settings.cache_dir)
     refuse_existing_map(settings.map_id, store, force=settings.force)
     if not is_ready_made(settings.local_features):  # raises when it cannot
@@ -182,25 +198,15 @@ class _Job:
             ready_made[name] if name in ready_made else describe_photos(context, photos, name)
             for name in settings.global_features
         ]
-        made = self._landmarks(photos, global_features)
-        if self.finish is not None:
-            made = self.finish(photos, made)
-        placed = [photos[row] for row in made.photos]
-        if settings.keep_colours and made.landmarks.colors is None:
-            colours = landmark_colours(context, placed, made.landmarks)
-            made = replace(made, landmarks=replace(made.landmarks, colors=colours))
-        content = build_content(
-            settings,
-            self.dataset,
-            photos,
-            context.features,
-            global_features,
-            made,
-            (*self.dataset.notes, *notes),
-        )
-        there = set(made.photos.tolist())
-        left_out = [photo.name for row, photo in enumerate(photos) if row not in there]
-        return self._publish(content, made, placed if settings.keep_photos else [], left_out)
+        pieces = self._landmarks(photos, global_features)
+        incoming = self.scratch / "incoming"
+        shutil.rmtree(incoming, ignore_errors=True)  # of a build that was killed here
+        try:
+            written = self._written(incoming, photos, global_features, pieces, notes)
+            with one_step(context.progress, "publication"):
+                return publish_pieces(self.store, written, accept=settings.accept)
+        finally:
+            shutil.rmtree(incoming, ignore_errors=True)
 
     def _collect(self) -> tuple[list[MappingPhoto], list[str]]:
         settings, features = self.settings, self.context.features
@@ -218,45 +224,82 @@ class _Job:
 
     def _landmarks(
         self, photos: Sequence[MappingPhoto], global_features: Sequence[GlobalFeatures]
-    ) -> MadeLandmarks:
+    ) -> tuple[MadeLandmarks, ...]:
         settings, inputs = self.settings, (self.context, self.dataset, photos)
         metric = settings.poses_are_metric
         if settings.method == "rgbd":
-            return landmarks_from_depth(*inputs, settings.depth, metric=metric)
+            return (landmarks_from_depth(*inputs, settings.depth, metric=metric),)
         if settings.method == "model":
-            return landmarks_from_reconstruction(
-                *inputs, settings.pixel_origin, settings.sfm, metric=metric
+            return (
+                landmarks_from_reconstruction(
+                    *inputs, settings.pixel_origin, settings.sfm, metric=metric
+                ),
             )
         return landmarks_from_matches(*inputs, global_features, settings.sfm, metric=metric)
 
-    def _publish(
+    def _written(
         self,
-        content: MapContent,
-        made: MadeLandmarks,
-        kept: Sequence[MappingPhoto],
-        left_out: Sequence[str],
-    ) -> Path:
-        incoming = self.scratch / "incoming"
-        shutil.rmtree(incoming, ignore_errors=True)  # of a build that was killed here
-        incoming.mkdir(parents=True)
-        try:
-            if kept:
-                keep_photos(self.context, incoming, kept)
-            with one_step(self.context.progress, "archive"):
-                if made.pairs is not None:
-                    write_pairs(incoming / PAIRS, *made.pairs)
-                if made.imported is not None:
-                    made.imported.write(incoming)
-                folder = publish_content(
-                    self.store,
-                    incoming,
-                    content,
-                    self.settings.map_id,
-                    left_out=left_out,
-                    examine=self.examine,
-                    accept=self.settings.accept,
+        incoming: Path,
+        photos: Sequence[MappingPhoto],
+        global_features: Sequence[GlobalFeatures],
+        pieces: Sequence[MadeLandmarks],
+        notes: Sequence[str],
+    ) -> list[WrittenMap]:
+        """Write and test the map of each piece, below a folder, the largest first."""
+        ids = ids_of_pieces(self.store, self.settings.map_id, len(pieces))
+        written: list[WrittenMap] = []
+        # The largest last: it names the others.
+        for made, map_id in reversed(list(zip(pieces, ids, strict=True))):
+            if map_id != self.settings.map_id:
+                made = replace(made, notes=(*made.notes, note_of_piece(self.settings.map_id)))
+            elif written:
+                refs: list[JsonValue] = [each.ref for each in written]
+                made = replace(
+                    made,
+                    notes=(*made.notes, note_of_largest(written)),
+                    settings={**made.settings, PIECES: refs},
                 )
-                wrote(sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()))
-            return folder
-        finally:
-            shutil.rmtree(incoming, ignore_errors=True)
+            folder = incoming / map_id
+            written.insert(0, self._write(folder, map_id, photos, global_features, made, notes))
+        return written
+
+    def _write(
+        self,
+        folder: Path,
+        map_id: str,
+        photos: Sequence[MappingPhoto],
+        global_features: Sequence[GlobalFeatures],
+        made: MadeLandmarks,
+        notes: Sequence[str],
+    ) -> WrittenMap:
+        settings, context = self.settings, self.context
+        if self.finish is not None:
+            made = self.finish(photos, made)
+        placed = [photos[row] for row in made.photos]
+        if settings.keep_colours and made.landmarks.colors is None:
+            colours = landmark_colours(context, placed, made.landmarks)
+            made = replace(made, landmarks=replace(made.landmarks, colors=colours))
+        content = build_content(
+            settings,
+            self.dataset,
+            photos,
+            context.features,
+            global_features,
+            made,
+            (*self.dataset.notes, *notes),
+        )
+        there = set(made.photos.tolist())
+        # Of a piece, that of the others says nothing: they make the largest map.
+        is_largest = map_id == settings.map_id
+        left_out = [p.name for row, p in enumerate(photos) if is_largest and row not in there]
+        folder.mkdir(parents=True)
+        if settings.keep_photos:
+            keep_photos(context, folder, placed)
+        with one_step(context.progress, "archive"):
+            if made.pairs is not None:
+                write_pairs(folder / PAIRS, *made.pairs)
+            if made.imported is not None:
+                made.imported.write(folder)
+            version = write_content(folder, content, map_id, left_out, self.examine)
+            wrote(sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()))
+        return WrittenMap(folder, map_id, version, len(placed))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,26 +29,28 @@ class Stretch:
     fate: str
 
 
-def fates(captured: Captured, opened: Map, astray: Collection[str] = ()) -> list[Stretch]:
+def fates(
+    captured: Captured, opened: Map, astray: Collection[str] = (), pieces: Sequence[Map] = ()
+) -> list[Stretch]:
     """Return what became of each second of each video, and of each photo of each folder.
 
     Args:
         captured: the capture.
         opened: its map.
         astray: names of frames that lie away from their film's others.
+        pieces: maps of the photos that nothing links to those of the map.
     """
-    placed = {image.name for image in opened.images} - set(astray)
+    fate_of = {i.name: f"used in {each.manifest.id}" for each in pieces for i in each.images}
+    fate_of |= {image.name: USED for image in opened.images if image.name not in astray}
     stretches = []
     for source, video in captured.videos.items():
-        stretches += _joined(source, _fates_of_seconds(source, video, placed))
+        stretches += _joined(source, _fates_of_seconds(source, video, fate_of))
     films = tuple(f"{source}/" for source in captured.videos)
     photos = [name for name in captured.photos if not name.startswith(films)]
     for source in dict.fromkeys(name.partition("/")[0] for name in photos):
         own = [name for name in photos if name.partition("/")[0] == source]
-        for fate, names in (
-            (USED, [name for name in own if name in placed]),
-            (NOT_CONNECTED, [name for name in own if name not in placed]),
-        ):
+        for fate in (*dict.fromkeys([USED, *fate_of.values()]), NOT_CONNECTED):
+            names = [name for name in own if fate_of.get(name, NOT_CONNECTED) == fate]
             if names:
                 shown = ", ".join(name.partition("/")[2] for name in names[:_NAMED])
                 more = ", ..." if len(names) > _NAMED else ""
@@ -56,15 +58,16 @@ def fates(captured: Captured, opened: Map, astray: Collection[str] = ()) -> list
     return stretches
 
 
-def _fates_of_seconds(source: str, video: FilmedVideo, placed: set[str]) -> list[str]:
+def _fates_of_seconds(source: str, video: FilmedVideo, fate_of: Mapping[str, str]) -> list[str]:
     motion = video.motion
     photos = dict(zip(video.chosen.rows.tolist(), video.names, strict=True))
     found = []
     for second in range(int(motion.seconds[-1]) + 1):
         rows = np.flatnonzero((motion.seconds >= second) & (motion.seconds < second + 1))
         names = [photos[row] for row in rows.tolist() if row in photos]
-        if any(f"{source}/{name}" in placed for name in names):
-            found.append(USED)
+        known = [fate for name in names if (fate := fate_of.get(f"{source}/{name}"))]
+        if known:
+            found.append(USED if USED in known else known[0])
         elif len(rows) and video.chosen.blurred[rows].all():
             found.append(BLURRED)
         elif names:

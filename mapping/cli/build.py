@@ -18,6 +18,7 @@ from mapping.cli.display import (
     print_costs,
     print_import,
     print_map,
+    print_pieces,
     say,
     say_peak_memory,
 )
@@ -185,7 +186,9 @@ def _build(settings: BuildSettings) -> None:
     costs = Costs()
     with StageProgress(ERR) as progress:
         folder = build_map(settings, progress, costs)
+    store = open_store(settings.maps_dir, settings.cache_dir)
     print_map(open_map(folder))
+    print_pieces(store, open_map(folder))
     print_costs(OUT, costs.table())
     say_peak_memory()
     pictures = scratch_folder(settings.maps_dir, settings.cache_dir, ".doubts")

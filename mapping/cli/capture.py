@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -10,16 +11,26 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
+from mapping.build.pieces import pieces_of
 from mapping.capture.account import fates, film_again, verdict
 from mapping.capture.job import Captured, Outlook, capture_map
 from mapping.capture.picture import draw_walk
 from mapping.capture.settings import CaptureSettings
 from mapping.capture.trying import Trials, out_of_order, try_photos
 from mapping.cli.acceptance import require_acceptance
-from mapping.cli.display import ERR, OUT, print_costs, print_map, say, say_notes, say_peak_memory
+from mapping.cli.display import (
+    ERR,
+    OUT,
+    print_costs,
+    print_map,
+    print_pieces,
+    say,
+    say_notes,
+    say_peak_memory,
+)
 from mapping.cli.progress import StageProgress
 from mapping.cluster.stage_timings import Costs
-from visloc.archive import Map, open_map
+from visloc.archive import Map, MapStore, open_map
 
 
 def capture(
@@ -47,11 +58,14 @@ def capture(
     picture = Path(f"{settings.map_id}-capture.png") if output is None else output
     picture.parent.mkdir(parents=True, exist_ok=True)
     draw_walk(opened, trials, picture)
+    store = MapStore(settings.maps_dir)
+    pieces = [store.open(ref) for ref in pieces_of(opened)]
     print_map(opened)
+    print_pieces(store, opened)
     print_costs(OUT, costs.table())
     say_peak_memory()
     say_notes(captured.notes)
-    _print_account(captured, opened, trials)
+    _print_account(captured, opened, trials, pieces)
     say(f"picture: {picture}")
     captured.forget()
     require_acceptance(
@@ -67,8 +81,9 @@ def _announce(outlook: Outlook) -> None:
     )
 
 
-def _print_account(captured: Captured, opened: Map, trials: Trials) -> None:
-    stretches = fates(captured, opened, out_of_order(opened, captured.videos))
+def _print_account(captured: Captured, opened: Map, trials: Trials, pieces: Sequence[Map]) -> None:
+    astray = out_of_order(opened, captured.videos)
+    stretches = fates(captured, opened, astray, pieces)
     table = Table(box=None)
     for name in ("source", "part", "what became of it"):
         table.add_column(name)

@@ -14,12 +14,13 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from mapping.build.pieces import pieces_of
 from mapping.cluster.stage_timings import StageCost
 from mapping.frames.georeference import Georeference
 from mapping.frames.rig_calibration import OUTLIER_MULTIPLE, RigCalibration, Spread
 from mapping.importers import ImportSummary
 from mapping.report.cameras import camera_lines, cameras_of
-from visloc.archive import Map
+from visloc.archive import Map, MapStore
 from visloc.archive.places import GeoCircle
 from visloc.archive.schema import photo_file
 from visloc.retrieval.fusion import EQUAL_GHARM
@@ -122,6 +123,15 @@ def print_map(opened: Map) -> None:
         table.add_row(name, escape(value))
     OUT.print(table)
     say_notes(summary["notes"])
+
+
+def print_pieces(store: MapStore, largest: Map) -> None:
+    """Print the maps that the same build made of photos that nothing links to the largest map."""
+    for ref in pieces_of(largest):
+        print_map(store.open(ref))
+        map_id, _, version = ref.partition("@")
+        if map_id not in store.ids() or store.current_version(map_id) != version:
+            say(f"not in use: {ref}; put it into use with: mapping use {ref}")
 
 
 def _retrieval(opened: Map) -> dict[str, str]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mapping.maps.editing import content_of, selected
 from mapping.maps.sets import Progress, publish_set, refuse_map_of_this_name, same_content
+from mapping.methods.pieces import MIN_PHOTOS
 from mapping.own_test.publishing import refuse_not_accepted
 from mapping.stages.publishing import new_version, photo_files
 from visloc.archive import Map, MapContent, MapStore, write_map
@@ -25,8 +26,6 @@ from visloc.geometry import Similarity
 from visloc.localization.constraints import MapGeometry
 from visloc.priors import MAX_TILES
 
-# Fewer photos localize too little to be a map of their own.
-MIN_PHOTOS = 5
 _TILE_OF = "a tile of "  # in the notes of a tile, before the map
 _MAX_CELLS = 2**31  # along one side
 

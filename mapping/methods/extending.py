@@ -92,11 +92,6 @@ def extend(
         points=found.points,
         observations=replace(observations, views=np.array(rows)[observations.views]),
         angles_deg=found.angles_deg,
-        apart=tuple(
-            left
-            for piece in model.apart
-            if (left := tuple(row for row in piece if row not in late.rows))
-        ),
     )
 
 

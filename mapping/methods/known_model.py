@@ -71,7 +71,7 @@ def landmarks_from_reconstruction(
     keypoints = open_features(dataset.root, "keypoints", known.keypoints_type)
     imported, notes = _imported_points(known, keypoints, photos, origin)
     again = replace(settings, pairs=("covisibility",), covisible_in=None, pairs_file=None)
-    made = landmarks_from_matches(context, dataset, photos, (), again, metric=metric)
+    (made,) = landmarks_from_matches(context, dataset, photos, (), again, metric=metric)
     return replace(made, anchor=anchor, imported=imported, notes=(*made.notes, *notes))
 
 

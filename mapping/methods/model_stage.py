@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from mapping.methods.colmap_scene import Rigs
 from mapping.methods.extending import with_late_photos
 from mapping.methods.intrinsics import Doubt
+from mapping.methods.look_alikes import without_look_alikes
 from mapping.methods.matching import Matches, camera_values, pose_values
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.methods.sparse_model import MAPPER_CONFIGS, SfmPhoto, SparseModel
@@ -84,6 +84,17 @@ def with_latecomers(
     return _from_item(context.work.read(key), photos)
 
 
+def believed_pairs(
+    context: BuildContext, photos: Sequence[MappingPhoto], matches: Sequence[Matches]
+) -> list[Matches]:
+    """Return the pairs of photos without poses that seem to show one place.
+
+    Among some of the photos, fewer matches would be missed: all photos tell more.
+    """
+    given = [_given(context.features, photo, posed=False) for photo in photos]
+    return without_look_alikes(given, matches)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _ModelTask:
     """A worker's part, for the whole map."""
@@ -97,7 +108,8 @@ class _ModelTask:
 
     def make(self, key: str, progress: Progress) -> None:
         def compute() -> Item:
-            given = [self._given(photo) for photo in self.photos]
+            posed = not self.settings.estimate_poses
+            given = [_given(self.features, photo, posed=posed) for photo in self.photos]
             config, refine = MAPPER_CONFIGS[self.settings.mapper], self.settings.refine
             inputs = self.rigs, self.matches, config, refine, self.work.scratch
             if self.settings.estimate_poses:
@@ -115,10 +127,6 @@ class _ModelTask:
     def _describe(self, row: int) -> NDArray[np.int8]:
         return _described(self.features, self.photos[row])
 
-    def _given(self, photo: MappingPhoto) -> SfmPhoto:
-        pose = None if self.settings.estimate_poses else photo.pose
-        return _given(self.features, photo, pose)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _LateTask:
@@ -133,7 +141,7 @@ class _LateTask:
 
     def make(self, key: str, progress: Progress) -> None:
         def compute() -> Item:
-            given = [_given(self.features, photo, None) for photo in self.photos]
+            given = [_given(self.features, photo, posed=False) for photo in self.photos]
             config, told = MAPPER_CONFIGS[self.settings.mapper], partial(progress, _LATE)
             inputs = given, self._describe, self.matches, self.model, config
             return _to_item(with_late_photos(*inputs, self.work.scratch, told))
@@ -152,14 +160,14 @@ def _described(features: LocalFeaturesSource, photo: MappingPhoto) -> NDArray[np
     return np.rint(_LARGEST * features.read(photo).descriptors).astype(np.int8)
 
 
-def _given(features: LocalFeaturesSource, photo: MappingPhoto, pose: Pose | None) -> SfmPhoto:
+def _given(features: LocalFeaturesSource, photo: MappingPhoto, *, posed: bool) -> SfmPhoto:
     return SfmPhoto(
         name=photo.name,
         sensor=photo.record.sensor_id,
         timestamp=photo.record.timestamp,
         camera=photo.camera,
         camera_known=photo.camera_known,
-        cam_from_world=pose,
+        cam_from_world=photo.pose if posed else None,
         keypoints=features.read(photo).keypoints,
     )
 
@@ -211,8 +219,6 @@ def _to_item(model: SparseModel) -> Item:
         "doubt_sensors": np.array(list(model.doubts), dtype=np.str_),
         "doubt_reasons": np.array([doubt.reason for doubt in model.doubts.values()], dtype=np.str_),
         "doubt_px": np.array([doubt.focal_length_px for doubt in model.doubts.values()]),
-        "apart": np.array([row for piece in model.apart for row in piece], dtype=np.int64),
-        "apart_bounds": np.cumsum([0, *map(len, model.apart)]),
         "undone": np.array(model.undone),
         **{f"observed_{name}": array for name, array in asdict(model.observations).items()},
     }
@@ -240,9 +246,5 @@ def _from_item(item: Item, photos: Sequence[MappingPhoto]) -> SparseModel:
         item["angles_deg"],
         bool(item["on_rigs"]),
         {sensor: Doubt(reason, focal) for sensor, reason, focal in doubts},
-        tuple(
-            tuple(item["apart"][start:end].tolist())
-            for start, end in pairwise(item["apart_bounds"].tolist())
-        ),
         int(item["undone"]),
     )

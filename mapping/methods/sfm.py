@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,8 @@ from mapping.methods.intrinsics import (
     origin_of,
 )
 from mapping.methods.matching import Matches, Verification, match_pairs
-from mapping.methods.model_stage import make_model, with_latecomers
+from mapping.methods.model_stage import believed_pairs, make_model, with_latecomers
+from mapping.methods.pieces import MIN_PHOTOS, models_beside
 from mapping.methods.scenes import find_pairs, make_scene
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.methods.sparse_model import MAPPER_CONFIGS, SparseModel
@@ -33,6 +35,7 @@ from mapping.progress import one_step
 from mapping.stages.context import BuildContext
 from mapping.stages.landmarks import MadeLandmarks, View, assemble_landmarks
 from mapping.stages.photos import MappingPhoto, some
+from mapping.stages.work_folder import key_of
 from visloc.archive import Anchor, GlobalFeatures
 from visloc.errors import InvalidInput
 from visloc.geometry import Pose, Similarity
@@ -52,13 +55,17 @@ def landmarks_from_matches(
     settings: SfmSettings,
     *,
     metric: bool,
-) -> MadeLandmarks:
+) -> tuple[MadeLandmarks, ...]:
     """Pair, match and verify the photos, and make landmarks of the matches.
 
     Args:
         photos: with poses, unless the settings estimate them.
         global_features: for the pairing retrieval.
         metric: whether a unit of the dataset's poses is a metre.
+
+    Returns:
+        The landmarks of each piece that photos fall apart into while their poses are estimated, the
+        largest first; one piece of photos with poses.
 
     Raises:
         InvalidInput: ``pairs.*``, ``sfm.*``.
@@ -76,20 +83,18 @@ def landmarks_from_matches(
     matched = match_pairs(context, photos, pairs.rows, verification)
     rigs = known_rigs(dataset, {photo.record.sensor_id for photo in photos})
     model = make_model(context, photos, rigs, *matched, settings)
+    models = [model]
     if settings.estimate_poses:
         look = _Look(context, photos, rigs, pairs.rows, verification, settings)
-        model = look.again(model, matched)
-    names = names_by_sensor((photo.record.sensor_id, photo.name) for photo in photos)
-    origins = {
-        sensor: origin_of(dataset.sensors[sensor], model.doubts.get(sensor)) for sensor in names
-    }
-    notes = [*_notes_on_absent(photos, model), *notes_on(origins, names)]
-    made = replace(
-        _placed_landmarks(dataset, photos, model, settings, metric=metric),
-        settings={**settings.record(), **_origins_record(origins, settings)},
-        pairs=(scene, pairs),
+        models = look.models(model, *matched)
+    absent = _notes_on_absent(photos, models)
+    return tuple(
+        replace(
+            _placed_landmarks(dataset, photos, one, settings, metric=metric, notes=absent),
+            pairs=(scene, pairs),
+        )
+        for one in models
     )
-    return replace(made, notes=(*notes, *made.notes))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,36 +108,47 @@ class _Look:
     verification: Verification
     settings: SfmSettings
 
-    def again(self, model: SparseModel, matched: tuple[list[Matches], str]) -> SparseModel:
-        """Return a model with more of the photos, with the cameras that the first one found.
+    def models(
+        self, model: SparseModel, matches: list[Matches], matches_key: str
+    ) -> list[SparseModel]:
+        """Return a model with more of the photos, and models of the photos that it still lacks.
 
-        When many found no place, all are mapped anew. Else they are placed in the model as it is.
+        The cameras that the model found help. When many photos found no place, all are mapped anew.
+        Else those without one are placed in the model as it is.
         """
         found = with_found_cameras(self.photos, model)
-        absent = np.array([view is None for view in model.views])
-        if found is not None and (model.on_rigs or absent.mean() > _MANY_ABSENT):
-            matched = match_pairs(self.context, found, self.pairs, self.verification)
-            model = self._anew(model, found, matched)
-        elif found is not None:
-            pairs = self.pairs[_with_their_groups(self.pairs, absent)]
-            matched = match_pairs(self.context, found, pairs, self.verification)
-        if None not in model.views or model.undone or model.on_rigs:
-            return model
-        photos = self.photos if found is None else found
-        return with_latecomers(self.context, photos, model, *matched, self.settings)
+        begun, of_absent = self.photos, (matches, matches_key)
+        if found is not None:
+            begun = [replace(p, camera=new.camera) for p, new in zip(begun, found, strict=True)]
+            absent = np.array([view is None for view in model.views])
+            if model.on_rigs or absent.mean() > _MANY_ABSENT:
+                of_absent = match_pairs(self.context, found, self.pairs, self.verification)
+                matches, matches_key = of_absent
+                with suppress(InvalidInput):  # a second look that finds nothing takes nothing away
+                    again = make_model(self.context, begun, self.rigs, *of_absent, self.settings)
+                    model = min(again, model, key=lambda each: each.views.count(None))
+            else:
+                pairs = self.pairs[_with_their_groups(self.pairs, absent)]
+                of_absent = match_pairs(self.context, found, pairs, self.verification)
+        if None in model.views and not (model.undone or model.on_rigs):
+            photos = self.photos if found is None else found
+            model = with_latecomers(self.context, photos, model, *of_absent, self.settings)
+        if model.views.count(None) < MIN_PHOTOS:
+            return [model]
+        believed = believed_pairs(self.context, begun, matches)
+        return [model, *models_beside(model, believed, partial(self._of_some, begun, matches_key))]
 
-    def _anew(
+    def _of_some(
         self,
-        model: SparseModel,
-        found: Sequence[MappingPhoto],
-        matched: tuple[list[Matches], str],
+        photos: Sequence[MappingPhoto],
+        matches_key: str,
+        rows: Sequence[int],
+        matches: Sequence[Matches],
     ) -> SparseModel:
-        """Map again, and return the model with more photos."""
-        begun = [replace(p, camera=new.camera) for p, new in zip(self.photos, found, strict=True)]
-        with suppress(InvalidInput):  # a second look that finds nothing takes nothing away
-            again = make_model(self.context, begun, self.rigs, *matched, self.settings)
-            model = min(again, model, key=lambda each: each.views.count(None))
-        return model
+        """Make a model of some of the photos, with the matches between them."""
+        some_photos = [photos[row] for row in rows]
+        key = key_of("matches_of_some", 1, matches=matches_key, photos=list(rows))
+        return make_model(self.context, some_photos, self.rigs, matches, key, self.settings)
 
 
 def _with_their_groups(pairs: NDArray[np.int64], absent: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -180,16 +196,30 @@ def _placed_landmarks(
     settings: SfmSettings,
     *,
     metric: bool,
+    notes: tuple[str, ...],
 ) -> MadeLandmarks:
-    """Put a model where the photos were taken, and make landmarks of its points."""
+    """Put a model where the photos were taken, and make landmarks of its points.
+
+    ``notes`` come before those on the model's cameras and place.
+    """
+    used = {p.record.sensor_id for p, view in zip(photos, model.views, strict=True) if view}
+    names = names_by_sensor(
+        (photo.record.sensor_id, photo.name)
+        for photo in photos
+        if photo.record.sensor_id in used | model.doubts.keys()
+    )
+    origins = {
+        sensor: origin_of(dataset.sensors[sensor], model.doubts.get(sensor)) for sensor in names
+    }
+    notes = (*notes, *notes_on(origins, names))
     placed = np.array([row for row, view in enumerate(model.views) if view is not None])
     views = [view for view in model.views if view is not None]
     points = model.points
-    notes: tuple[str, ...] = ()
     rig_scale: float | None = 1.0
     anchor = Anchor(kind="dataset", images=len(photos))
     if settings.estimate_poses:
-        similarity, anchor, notes = _anchored(dataset, photos, model)
+        similarity, anchor, on_anchor = _anchored(dataset, photos, model)
+        notes = (*notes, *on_anchor)
         views = [View(v.camera, similarity.move(v.cam_from_world)) for v in views]
         points = similarity.apply(points)
         # Without rigs in it, the reconstruction had a unit of its own.
@@ -204,7 +234,7 @@ def _placed_landmarks(
         views=tuple(views),
         landmarks=landmarks,
         rows=tuple(rows),
-        settings={},
+        settings={**settings.record(), **_origins_record(origins, settings)},
         metric=metric,
         anchor=anchor,
         rig_scale=rig_scale,
@@ -212,25 +242,21 @@ def _placed_landmarks(
     )
 
 
-def _notes_on_absent(photos: Sequence[MappingPhoto], model: SparseModel) -> list[str]:
+def _notes_on_absent(
+    photos: Sequence[MappingPhoto], models: Sequence[SparseModel]
+) -> tuple[str, ...]:
+    """Return notes on pairs that were not used, and photos that are in no model."""
     notes = []
-    if model.undone:
+    if undone := sum(model.undone for model in models):
         notes.append(
-            f"{model.undone} pairs of photos were not used: they joined places that look alike, "
+            f"{undone} pairs of photos were not used: they joined places that look alike, "
             "and photos in the joined model missed what others beside them saw"
         )
-    absent = [photo.name for photo, v in zip(photos, model.views, strict=True) if v is None]
-    if not absent:
-        return notes
-    notes.append(f"{len(absent)} of {len(photos)} photos found no place: {some(absent)}")
-    if model.apart:
-        pieces = ", ".join(str(len(piece)) for piece in model.apart)
-        notes.append(
-            f"the photos fell apart into {len(model.apart) + 1} pieces that nothing links for "
-            f"sure: the map is of the largest, without others of {pieces} photos. Photos of the "
-            "way between them would link them"
-        )
-    return notes
+    views = zip(*(model.views for model in models), strict=True)
+    absent = [p.name for p, seen in zip(photos, views, strict=True) if not any(seen)]
+    if absent:
+        notes.append(f"{len(absent)} of {len(photos)} photos found no place: {some(absent)}")
+    return tuple(notes)
 
 
 def _origins_record(

@@ -85,7 +85,6 @@ class SparseModel:
         on_rigs: whether known rigs held cameras together; the model then has their unit.
         doubts: by sensor, why refined intrinsics are not believed. Known intrinsics in doubt stayed
             as they were. Photos whose estimated camera is implausible were left out.
-        apart: rows of the photos of each other model, which nothing links to this one.
         undone: pairs of photos whose matches were not used, as models with them showed two places
             in one.
     """
@@ -96,7 +95,6 @@ class SparseModel:
     angles_deg: NDArray[np.float32]
     on_rigs: bool
     doubts: Mapping[str, Doubt]
-    apart: tuple[tuple[int, ...], ...] = ()
     undone: int = 0
 
 

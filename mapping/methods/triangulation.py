@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count
@@ -36,8 +36,6 @@ from visloc.errors import VislocError, refuse
 MAPPING, TRIANGULATION = "incremental mapping", "triangulation"
 # After so many models that put cameras in doubt, no camera with a prior is refined any more.
 _MAX_JUDGEMENTS = 3
-# Photos of another model that are worth telling.
-_MIN_PIECE = 3
 
 
 def triangulate(
@@ -105,7 +103,6 @@ def reconstruct(
         known = {photo.sensor for photo in photos if photo.camera_known}
         constant = set() if "intrinsics" in refine else known
         placed = _Placed(len(photos), partial(progress, MAPPING))
-        apart: list[tuple[int, ...]] = []
 
         def options_with(doubts: Mapping[str, Doubt]) -> pycolmap.IncrementalPipelineOptions:
             options = pipeline_options(config)
@@ -120,9 +117,7 @@ def reconstruct(
             left_out = doubts.keys() - known
             models = _map_incrementally(path, options_with(doubts), placed)
             if models:
-                largest = max(models.values(), key=lambda m: (m.num_reg_images(), m.num_points3D()))
-                apart[:] = _photos_apart(models.values(), largest, scene)
-                return largest
+                return max(models.values(), key=lambda m: (m.num_reg_images(), m.num_points3D()))
             raise _no_model(photos, matches, doubts, left_out)
 
         refined = scene.cameras.keys() - constant
@@ -137,7 +132,6 @@ def reconstruct(
 
         result = _with_misplaced_again(result, go_on, scene, photos, thinned, config)
         found = scene.read(result, photos, ("poses", "intrinsics"), doubts)
-        found = replace(found, apart=tuple(apart))
     progress(MAPPING, len(photos), len(photos))
     return _with_all_points(
         found, photos, rigs, matches, config, work, partial(progress, TRIANGULATION)
@@ -227,25 +221,7 @@ def _with_all_points(
         observations=replace(made.observations, views=views),
         on_rigs=found.on_rigs,
         doubts=found.doubts,
-        apart=found.apart,
     )
-
-
-def _photos_apart(
-    models: Iterable[pycolmap.Reconstruction],
-    largest: pycolmap.Reconstruction,
-    scene: ColmapScene,
-) -> list[tuple[int, ...]]:
-    """Return the rows of the photos that each of the other models adds, the most first."""
-    rows = {image.image_id: row for row, image in enumerate(scene.images)}
-    known = set(largest.reg_image_ids())
-    pieces = []
-    for model in sorted(models, key=lambda m: -m.num_reg_images()):
-        new = set(model.reg_image_ids()) - known
-        known |= new
-        if len(new) >= _MIN_PIECE:
-            pieces.append(tuple(sorted(rows[image_id] for image_id in new)))
-    return sorted(pieces, key=lambda piece: -len(piece))
 
 
 @dataclass(slots=True)

@@ -53,8 +53,6 @@ def publish_content(
     map_id: str,
     *,
     based_on: str | None = None,
-    left_out: Sequence[str] = (),
-    examine: Examine | None = None,
     accept: bool = False,
 ) -> Path:
     """Write content beside the files that a folder has already, test it, and publish it.
@@ -62,14 +60,12 @@ def publish_content(
     A version that its own test speaks against is published, but not made current.
 
     Args:
-        left_out: photos that found no place, as for ``doubts_about``.
-        examine: finds more doubts.
         accept: make it current all the same.
 
     Raises:
         Conflict: ``map.outdated``.
     """
-    version = write_content(incoming, content, map_id, left_out, examine)
+    version = write_content(incoming, content, map_id)
     return publish_tested(store, incoming, map_id, version, based_on=based_on, accept=accept)
 
 
@@ -117,6 +113,10 @@ def write_content(
     """Write content beside the files that a folder has already, test it, and return its version.
 
     What the content knows of the map it was made from is learned anew.
+
+    Args:
+        left_out: photos that found no place, as for ``doubts_about``.
+        examine: finds more doubts.
     """
     version, created = new_version()
     write_map(folder, content, map_id=map_id, version=version, created=created)

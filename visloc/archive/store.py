@@ -171,6 +171,15 @@ class MapStore:
             refuse_missing_tiles(manifest, self._manifests)
             self.backend.set_current(map_id, version)
 
+    def withdraw(self, map_id: str) -> None:
+        """Take a map out of use, atomically: none of its versions is current, and all stay.
+
+        Nothing happens when none was. Sets that name a version keep it.
+        """
+        with self.backend.changing():
+            if self.backend.current(checked_name(map_id, "map")) is not None:
+                self.backend.withdraw(map_id)
+
     def remove(self, map_id: str, version: str) -> None:
         """Remove a version; with the last one, the map.
 

@@ -5,7 +5,7 @@ the handful of keypoints near the pixel where a pose predicts the landmark, many
 too few matches support are tried: that of all matches, and those of each searched place with its
 own matches alone. Matches by chance spread evenly over the disc in which a landmark is looked for;
 right ones lie in its middle. How far the middle is fuller than by chance tells whether a pose is
-right (docs/decisions/0038-guided-by-a-doubtful-pose.md).
+right (docs/decisions/0039-guided-by-a-doubtful-pose.md).
 """
 
 from __future__ import annotations

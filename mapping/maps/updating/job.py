@@ -318,7 +318,7 @@ class _Job:
                 replace(one, descriptors=capture.described[one.fingerprint.name])
                 for one in content.global_features
             ]
-            made = landmarks_from_matches(
+            (made,) = landmarks_from_matches(
                 self.context, dataset, photos, described, SfmSettings(), metric=content.metric
             )
             return made, None

@@ -25,8 +25,9 @@ class _Image:
 class _Opened:
     """The parts of a map that an account asks for."""
 
-    def __init__(self, names: list[str]) -> None:
+    def __init__(self, names: list[str], map_id: str = "room") -> None:
         self.images = [_Image(name) for name in names]
+        self.manifest = SimpleNamespace(id=map_id)
 
 
 def captured() -> Captured:
@@ -57,6 +58,21 @@ def test_every_second_has_a_fate() -> None:
         ("walk", "second 6 to 8", "too blurred"),
         ("walk", "second 8 to 10", "not connected"),
         ("photos", "1 photos: a.jpg", "used"),
+    ]
+
+
+def test_what_another_piece_has_is_not_to_be_filmed_again() -> None:
+    opened: Any = _Opened([f"walk/0000{i}.000s.jpg" for i in range(4)])
+    piece: Any = _Opened(["walk/00008.000s.jpg", "walk/00009.000s.jpg", "photos/a.jpg"], "room-2")
+    stretches = fates(captured(), opened, pieces=[piece])
+    assert [(s.source, s.what, s.fate) for s in stretches if "used" in s.fate] == [
+        ("walk", "second 0 to 4", "used"),
+        ("walk", "second 8 to 10", "used in room-2"),
+        ("photos", "1 photos: a.jpg", "used in room-2"),
+    ]
+    trials = Trials(np.arange(4), np.ones(4, np.bool_))
+    assert [line[:21] for line in film_again(trials, stretches, opened)] == [
+        "walk, second 6 to 8: "
     ]
 
 

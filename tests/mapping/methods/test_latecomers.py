@@ -7,7 +7,6 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from mapping.methods.extending import extend
@@ -121,10 +120,7 @@ def test_a_model_with_all_photos_gets_none() -> None:
     assert (late.rows, late.matches) == ((), ())
 
 
-@pytest.mark.parametrize("apart", [(), ((8, 9), (10, 11))])
-def test_late_photos_are_adjusted_and_all_others_stay(
-    apart: tuple[tuple[int, ...], ...], tmp_path: Path
-) -> None:
+def test_late_photos_are_adjusted_and_all_others_stay(tmp_path: Path) -> None:
     photos, looks, matches, model = walk()
     late = late_in(photos, looks, matches, model)
     shifted = list(late.views)
@@ -135,11 +131,10 @@ def test_late_photos_are_adjusted_and_all_others_stay(
         shifted[row] = View(CAMERA, Pose(pose.rotation, pose.translation + 0.01))
     some = Late((*shifted[: NUM_PLACED + 2], None, None), late.rows[:2], ())
     some = replace(some, matches=tuple(p for p in late.matches if p.second < NUM_PLACED + 2))
-    grown = extend(photos, replace(model, apart=apart), some, CONFIG, tmp_path)
+    grown = extend(photos, model, some, CONFIG, tmp_path)
     assert grown.views[:NUM_PLACED] == model.views[:NUM_PLACED]
     assert max(off(grown.views[row], row) for row in some.rows) < 0.005
     assert grown.views[NUM_PLACED + 2 :] == (None, None)
-    assert grown.apart == apart[1:]
     seen = np.bincount(grown.observations.views, minlength=NUM_PHOTOS)
     assert (seen[list(some.rows)] > 200).all()
     # What photos of the model saw before, they still see, but for a few.

@@ -125,4 +125,3 @@ def test_no_model_holds_photos_of_two_hallways(tmp_path: Path) -> None:
     places = {place_of(row) for row, view in enumerate(model.views) if view is not None}
     assert len(places) == 1
     assert sum(view is not None for view in model.views) == PHOTOS_EACH
-    assert [len(piece) for piece in model.apart] == [PHOTOS_EACH]

@@ -5,18 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from mapping.methods.model_stage import _from_item, _to_item
 from tests.mapping.methods.test_sfm import FOUND, model_of, photo_of
 
 
-@pytest.mark.parametrize("apart", [(), ((1, 2),), ((1, 3), (2,))])
-def test_a_model_comes_back_as_it_went(apart: tuple[tuple[int, ...], ...]) -> None:
+def test_a_model_comes_back_as_it_went() -> None:
     photos = [photo_of(number, "film") for number in range(4)]
-    model = replace(model_of(FOUND, None, None, None), apart=apart, undone=3)
+    model = replace(model_of(FOUND, None, None, None), undone=3)
     again = _from_item(_to_item(model), photos)
-    assert (again.apart, again.undone, again.on_rigs) == (apart, 3, False)
+    assert (again.undone, again.on_rigs) == (3, False)
     assert [view is None for view in again.views] == [False, True, True, True]
     view, known = again.views[0], model.views[0]
     assert view is not None

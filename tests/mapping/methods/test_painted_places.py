@@ -86,7 +86,6 @@ def test_a_second_walk_through_the_room_joins_the_first(
     photos, matches = matched([*first, *second])
     model = reconstruct(photos, {}, matches, CONFIG, (), tmp_path, lambda *_: None)
     assert all(model.views)
-    assert model.apart == ()
 
 
 def test_no_pair_joins_a_room_of_one_design_with_other_pictures(first: list[LocalFeatures]) -> None:

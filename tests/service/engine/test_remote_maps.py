@@ -233,6 +233,19 @@ def test_publication_without_activation_and_rollback(
     assert new_store("other").current_version("room") == "v1"
 
 
+def test_a_map_out_of_use_keeps_its_versions(
+    published: RemoteMapStore, new_store: Callable[..., RemoteMapStore]
+) -> None:
+    for _ in range(2):  # the second time, nothing is left to do
+        published.withdraw("room")
+        assert published.ids() == []
+        assert new_store("other").ids() == []
+        assert published.versions("room") == ["v1", "v2"]
+
+    published.set_current("room", "v1")
+    assert published.current_version("room") == "v1"
+
+
 def test_a_version_that_exists_is_not_published_again(
     shared: RemoteMapStore, new_reader: Callable[..., RemoteMapStore], make: Callable[..., Path]
 ) -> None:

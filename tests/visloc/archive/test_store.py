@@ -126,6 +126,19 @@ def test_with_its_last_version_a_map_is_gone(two_versions: MapStore) -> None:
     assert caught.value.code == "map.unknown"
 
 
+def test_a_map_out_of_use_keeps_its_versions(two_versions: MapStore) -> None:
+    for _ in range(2):  # the second time, nothing is left to do
+        two_versions.withdraw("room")
+        assert two_versions.ids() == []
+        assert two_versions.versions("room") == ["v1", "v2"]
+    with pytest.raises(NotFound) as caught:
+        two_versions.open("room")
+    assert caught.value.code == "map.none_in_use"
+
+    two_versions.set_current("room", "v1")
+    assert two_versions.open("room").ref == "room@v1"
+
+
 def test_no_version_is_removed_where_nothing_says_which_is_in_use(two_versions: MapStore) -> None:
     (two_versions.root / "room" / "current").write_text("??")
     with pytest.raises(MapCorrupt) as caught:

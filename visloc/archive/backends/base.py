@@ -92,6 +92,9 @@ class Backend(Protocol):
     def set_current(self, map_id: str, version: str) -> None:
         """Switch ``current`` atomically. Only within ``changing``."""
 
+    def withdraw(self, map_id: str) -> None:
+        """Remove ``current`` atomically; the versions stay. Only within ``changing``."""
+
     def remove(self, map_id: str, version: str, *, is_last: bool) -> Callable[[], object]:
         """Make a version disappear; with the last one, the map. Only within ``changing``.
 

@@ -121,6 +121,11 @@ class FolderBackend:
         _prepare_current(parent, version).replace(parent / CURRENT)
         _sync_folder(parent)
 
+    def withdraw(self, map_id: str) -> None:
+        parent = self.root / map_id
+        (parent / CURRENT).unlink(missing_ok=True)
+        _sync_folder(parent)
+
     def remove(self, map_id: str, version: str, *, is_last: bool) -> Callable[[], object]:
         leaving = self.root / map_id if is_last else self.root / map_id / version
         # Beside where it was, as a full disk may have no room for another folder.

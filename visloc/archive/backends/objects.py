@@ -158,6 +158,11 @@ class ObjectBackend:
         self._publisher.write_current(map_id, version)
         self._index.note(map_id, self.versions(map_id), version)
 
+    def withdraw(self, map_id: str) -> None:
+        with self.storage.asking(), suppress(FileNotFoundError):
+            self.storage.fs.rm_file(self.storage.path(map_id, CURRENT))
+        self._index.note(map_id, self.versions(map_id), None)
+
     def remove(self, map_id: str, version: str, *, is_last: bool) -> Callable[[], object]:
         known, fs = self._index.of(map_id), self.storage.fs
         with self._lock_of(map_id, version):

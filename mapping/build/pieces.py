@@ -1,0 +1,137 @@
+"""The maps of one build: photos without poses may fall apart into pieces, each a map of its own.
+
+The largest piece has the id that was asked for, such as ``room``; the others are ``room-2``,
+``room-3`` and so on, the larger ones first. A map of such an id that is no piece of ``room`` is
+passed over. The pieces have no common frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import count, islice
+from pathlib import Path
+
+from mapping.own_test.publishing import publish_tested
+from visloc.archive import Map, MapStore
+from visloc.archive.checks import read_manifest
+from visloc.archive.schema import ID_PATTERN
+from visloc.errors import MapCorrupt, refuse
+
+# In the settings of the largest piece, for the manifest.
+PIECES = "pieces"
+# As many digits fit behind the id.
+_LONGEST_SUFFIX = "-999"
+
+
+@dataclass(frozen=True, slots=True)
+class WrittenMap:
+    """A complete version that is not published yet."""
+
+    folder: Path
+    map_id: str
+    version: str
+    photos: int
+
+    @property
+    def ref(self) -> str:
+        return f"{self.map_id}@{self.version}"
+
+
+def refuse_long_id(map_id: str) -> None:
+    """Refuse an id that leaves no room for the ids of pieces.
+
+    Raises:
+        InvalidInput: ``map.id``.
+    """
+    if not ID_PATTERN.fullmatch(f"{map_id}{_LONGEST_SUFFIX}"):
+        raise refuse(
+            "map.id",
+            "this id is not valid, or too long for the ids of pieces of the map",
+            field="--map",
+            expected=f"up to {64 - len(_LONGEST_SUFFIX)} letters, digits, '.', '_', '-', "
+            "beginning with a letter or digit",
+            got=map_id,
+        )
+
+
+def ids_of_pieces(store: MapStore, map_id: str, num: int) -> list[str]:
+    """Return the ids of a number of pieces, the largest first."""
+    return [map_id, *islice(_free_ids(store, map_id), num - 1)]
+
+
+def note_of_piece(map_id: str) -> str:
+    """Return the note by which a later build knows a piece of a map."""
+    return f"a piece of {map_id}: nothing links its photos to the others of that build"
+
+
+def note_of_largest(pieces: Sequence[WrittenMap]) -> str:
+    """Return the note that names the pieces beside the largest one."""
+    others = ", ".join(f"{each.ref} of {each.photos} photos" for each in pieces)
+    return (
+        f"the photos fell apart into {len(pieces) + 1} pieces that nothing links for sure, and "
+        f"this map is of the largest. The others are maps of their own: {others}. Photos of the "
+        "way between them would link them"
+    )
+
+
+def pieces_of(opened: Map) -> list[str]:
+    """Return ``id@version`` of the other pieces of the build that made a map, largest first."""
+    pieces = opened.manifest.method.settings.get(PIECES, [])
+    return [str(ref) for ref in pieces] if isinstance(pieces, list) else []
+
+
+def publish_pieces(store: MapStore, pieces: Sequence[WrittenMap], *, accept: bool) -> Path:
+    """Publish the maps of a build, which replace those of the build before.
+
+    If the test of the largest piece speaks against it, none is put into use, and those that were
+    stay. Otherwise each is put into use unless its own test speaks against it, and pieces of
+    earlier builds that none replaces are taken out of use. The largest is published last: once it
+    is there, all are.
+
+    Args:
+        store: where they are published.
+        pieces: the largest first.
+        accept: put all into use whatever their tests say.
+
+    Returns:
+        The folder of the largest.
+    """
+    largest, *others = pieces
+    is_used = accept or not _is_doubtful(largest)
+    stale = set(_known_pieces(store, largest.map_id)) if is_used else set()
+    for each in others:
+        is_current = is_used and (accept or not _is_doubtful(each))
+        store.publish(each.folder, each.map_id, each.version, make_current=is_current)
+        if is_current:
+            stale.discard(each.map_id)
+    for map_id in sorted(stale):
+        store.withdraw(map_id)
+    return publish_tested(store, largest.folder, largest.map_id, largest.version, accept=accept)
+
+
+def _is_doubtful(written: WrittenMap) -> bool:
+    return bool(read_manifest(written.folder).parts.doubts)
+
+
+def _free_ids(store: MapStore, map_id: str) -> Iterator[str]:
+    for number in count(2):
+        piece_id = f"{map_id}-{number}"
+        if not store.versions(piece_id) or _is_piece(store, piece_id, map_id):
+            yield piece_id
+
+
+def _known_pieces(store: MapStore, map_id: str) -> Iterator[str]:
+    """Yield the ids of maps that earlier builds made as pieces of a map."""
+    for other in store.ids():
+        start, _, number = other.rpartition("-")
+        if start == map_id and number.isdecimal() and _is_piece(store, other, map_id):
+            yield other
+
+
+def _is_piece(store: MapStore, piece_id: str, map_id: str) -> bool:
+    try:
+        last = store.versions(piece_id)[-1]
+        return note_of_piece(map_id) in store.outline(f"{piece_id}@{last}").manifest.notes
+    except MapCorrupt:
+        return False
