@@ -102,8 +102,20 @@ def publish_pieces(store: MapStore, pieces: Sequence[WrittenMap], *, accept: boo
 
     Returns:
         The folder of the largest.
+
+    Raises:
+        Conflict: ``map.exists`` when somebody else published a map with the id of a piece since the
+            ids were chosen. Nothing is published; the same build chooses other ids.
     """
     largest, *others = pieces
+    for each in others:
+        if store.versions(each.map_id) and not _is_piece(store, each.map_id, largest.map_id):
+            raise refuse(
+                "map.exists",
+                f"a map {each.map_id!r} was published while this build was making a piece of that "
+                "name; the same command makes the pieces again under other names",
+                field="--map",
+            )
     is_used = accept or not _is_doubtful(largest)
     stale = set(_known_pieces(store, largest.map_id)) if is_used else set()
     for each in others:

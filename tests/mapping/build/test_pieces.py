@@ -27,7 +27,7 @@ from mapping.own_test.publishing import write_content
 from mapping.sample import write_sample
 from visloc.archive import Map, MapStore, open_map
 from visloc.archive.schema import Doubt
-from visloc.errors import InvalidInput
+from visloc.errors import Conflict, InvalidInput
 from visloc.features import make_local_features
 from visloc.geometry import Pose
 from visloc.images import read_photo_file
@@ -276,6 +276,21 @@ def test_a_map_merged_of_pieces_is_no_piece(
     publish(store, written("home"))
     assert in_use(store).keys() == {"home", "home-3"}
     assert ids_of_pieces(store, "home", 3) == ["home", "home-2", "home-4"]
+
+
+def test_a_map_that_somebody_published_meanwhile_is_not_replaced(
+    store: MapStore, written: Written, sample_map: Map, tmp_path: Path
+) -> None:
+    pieces = written("home"), written("home-2"), written("home-3")
+    folder = tmp_path / "other"
+    folder.mkdir()
+    version = write_content(folder, content_of(sample_map), "home-3")
+    store.publish(folder, "home-3", version)
+    with pytest.raises(Conflict) as caught:
+        publish(store, *pieces)
+    assert caught.value.code == "map.exists"
+    assert in_use(store) == {"home-3": version}
+    assert store.versions("home-2") == []
 
 
 def test_a_folder_without_versions_is_no_piece(store: MapStore, written: Written) -> None:
