@@ -251,7 +251,9 @@ class _Job:
         # The largest last: it names the others.
         for made, map_id in reversed(list(zip(pieces, ids, strict=True))):
             if map_id != self.settings.map_id:
-                made = replace(made, notes=(*made.notes, note_of_piece(self.settings.map_id)))
+                made = replace(
+                    made, notes=(*made.notes, note_of_piece(map_id, self.settings.map_id))
+                )
             elif written:
                 refs: list[JsonValue] = [each.ref for each in written]
                 made = replace(

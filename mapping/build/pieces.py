@@ -8,6 +8,7 @@ passed over. The pieces have no common frame.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import count, islice
 from pathlib import Path
@@ -16,7 +17,7 @@ from mapping.own_test.publishing import publish_tested
 from visloc.archive import Map, MapStore
 from visloc.archive.checks import read_manifest
 from visloc.archive.schema import ID_PATTERN
-from visloc.errors import MapCorrupt, refuse
+from visloc.errors import MapCorrupt, NotFound, refuse
 
 # In the settings of the largest piece, for the manifest.
 PIECES = "pieces"
@@ -60,9 +61,14 @@ def ids_of_pieces(store: MapStore, map_id: str, num: int) -> list[str]:
     return [map_id, *islice(_free_ids(store, map_id), num - 1)]
 
 
-def note_of_piece(map_id: str) -> str:
-    """Return the note by which a later build knows a piece of a map."""
-    return f"a piece of {map_id}: nothing links its photos to the others of that build"
+def note_of_piece(piece_id: str, map_id: str) -> str:
+    """Return the note by which a later build knows a piece of a map.
+
+    It names the piece, since maps that are merged of pieces have their notes and are none.
+    """
+    return (
+        f"{piece_id} is a piece of {map_id}: nothing links its photos to the others of that build"
+    )
 
 
 def note_of_largest(pieces: Sequence[WrittenMap]) -> str:
@@ -96,8 +102,20 @@ def publish_pieces(store: MapStore, pieces: Sequence[WrittenMap], *, accept: boo
 
     Returns:
         The folder of the largest.
+
+    Raises:
+        Conflict: ``map.exists`` when somebody else published a map with the id of a piece since the
+            ids were chosen. Nothing is published; the same build chooses other ids.
     """
     largest, *others = pieces
+    for each in others:
+        if store.versions(each.map_id) and not _is_piece(store, each.map_id, largest.map_id):
+            raise refuse(
+                "map.exists",
+                f"a map {each.map_id!r} was published while this build was making a piece of that "
+                "name; the same command makes the pieces again under other names",
+                field="--map",
+            )
     is_used = accept or not _is_doubtful(largest)
     stale = set(_known_pieces(store, largest.map_id)) if is_used else set()
     for each in others:
@@ -130,8 +148,9 @@ def _known_pieces(store: MapStore, map_id: str) -> Iterator[str]:
 
 
 def _is_piece(store: MapStore, piece_id: str, map_id: str) -> bool:
-    try:
-        last = store.versions(piece_id)[-1]
-        return note_of_piece(map_id) in store.outline(f"{piece_id}@{last}").manifest.notes
-    except MapCorrupt:
-        return False
+    note = note_of_piece(piece_id, map_id)
+    # A file may say which version is current although there is none.
+    for last in store.versions(piece_id)[-1:]:
+        with suppress(MapCorrupt, NotFound):  # damaged, or removed meanwhile
+            return note in store.outline(f"{piece_id}@{last}").manifest.notes
+    return False

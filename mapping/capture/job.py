@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 
 from mapping.build.build import build_map, refuse_existing_map
+from mapping.build.pieces import refuse_long_id
 from mapping.build.settings import BuildSettings
 from mapping.capture.frames import FilmedVideo, photo_name
 from mapping.capture.markers import find_markers, grey_photos
@@ -103,6 +104,7 @@ def capture_map(
 
     Raises:
         Conflict: ``map.exists`` without ``force``; ``build.running``.
+        InvalidInput: ``map.id``, also for one that leaves no room for the ids of pieces.
         NotFound, InvalidInput: ``capture.*`` for sources and lengths that cannot be used; what
             importers and builds raise.
     """
@@ -117,6 +119,8 @@ def capture_map(
         finished = _published_before(settings, root, store)
         if finished is None:
             refuse_existing_map(settings.map_id, store, force=settings.force)
+            if sources.videos or sources.folders:  # their photos have no poses
+                refuse_long_id(settings.map_id)
             _begin(settings, root, store)
         wanted = _wanted_seconds(length, sources)
         studied = study_videos(sources, WorkFolder(root), settings.photos, wanted, progress)

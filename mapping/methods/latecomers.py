@@ -101,8 +101,7 @@ def place_latecomers(
         best.sort(key=lambda each: -each[1].pose.num_inliers)
         for row, each in best:
             proposed[row].remove(each)  # until photos that it shares matches with are placed
-            if growing.shows(row, each):
-                growing.place(row, each)
+            if growing.shows(row, each) and growing.place(row, each):
                 placed.append(row)
                 waiting.discard(row)
                 changed = waiting & growing.partners(row)
@@ -211,13 +210,22 @@ class _Growing:
             self._looks[row] = self._describe(row)
         return self._looks[row]
 
-    def place(self, row: int, proposed: _Proposed) -> None:
-        """Give a photo its pose, and make landmarks of what it shares with others."""
+    def place(self, row: int, proposed: _Proposed) -> bool:
+        """Give a photo its pose, and make landmarks of what it shares with others.
+
+        Returns:
+            False when no pair fits the pose, so that the photo would see no landmark: then it has
+            no place.
+        """
         camera = self._cameras[self._photos[row].sensor]
         view = self.views[row] = View(camera, proposed.pose.rig_from_world)
+        pairs = self.fitting([row])
+        if not pairs:
+            self.views[row] = None
+            return False
         own, landmarks = proposed.inliers.T
         self._landmarks[row][own] = landmarks
-        for pair in self.fitting([row]):
+        for pair in pairs:
             other = pair.second if pair.first == row else pair.first
             rows, theirs = (pair.rows if pair.first == row else pair.rows[:, ::-1]).T
             known = self.views[other]
@@ -234,6 +242,7 @@ class _Growing:
             self._landmarks[row][rows[good]] = numbers
             self._landmarks[other][theirs[good]] = numbers
             self._points = np.concatenate([self._points, points[good]])
+        return True
 
     def fitting(self, rows: Collection[int]) -> list[Matches]:
         """Return the matches of pairs of some photos that fit the poses, of pairs that do."""

@@ -27,7 +27,7 @@ from mapping.own_test.publishing import write_content
 from mapping.sample import write_sample
 from visloc.archive import Map, MapStore, open_map
 from visloc.archive.schema import Doubt
-from visloc.errors import InvalidInput
+from visloc.errors import Conflict, InvalidInput
 from visloc.features import make_local_features
 from visloc.geometry import Pose
 from visloc.images import read_photo_file
@@ -117,7 +117,7 @@ def test_the_largest_names_the_other(built: Path) -> None:
     assert pieces_of(largest) == [other.ref]
     assert pieces_of(other) == []
     assert any(f"{other.ref} of {IN_ROOM[1]} photos" in n for n in largest.manifest.notes)
-    assert note_of_piece("home") in other.manifest.notes
+    assert note_of_piece("home-2", "home") in other.manifest.notes
 
 
 @pytest.mark.parametrize("number", [0, 1])
@@ -169,7 +169,7 @@ def written(sample_map: Map, tmp_path: Path) -> Written:
         folder = tmp_path / "incoming" / map_id
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
-        notes = () if map_id == "home" else (note_of_piece("home"),)
+        notes = () if map_id == "home" else (note_of_piece(map_id, "home"),)
         doubts = [Doubt(kind="own_test", message="it is wrong", photos=())] * doubtful
         content = replace(content_of(sample_map), notes=notes)
         version = write_content(folder, content, map_id, examine=lambda _: doubts)
@@ -261,6 +261,47 @@ def test_maps_of_others_are_passed_over(
     publish(store, written("home"))
     assert in_use(store).keys() == {"home", "home-2"}
     assert in_use(store)["home-2"] == version
+
+
+def test_a_map_merged_of_pieces_is_no_piece(
+    store: MapStore, written: Written, sample_map: Map, tmp_path: Path
+) -> None:
+    """It has the notes of both, and its id may look like that of a piece."""
+    publish(store, written("home"), written("home-2"))
+    notes = store.open("home-2").manifest.notes
+    folder = tmp_path / "merged"
+    folder.mkdir()
+    version = write_content(folder, replace(content_of(sample_map), notes=notes), "home-3")
+    store.publish(folder, "home-3", version)
+    publish(store, written("home"))
+    assert in_use(store).keys() == {"home", "home-3"}
+    assert ids_of_pieces(store, "home", 3) == ["home", "home-2", "home-4"]
+
+
+def test_a_map_that_somebody_published_meanwhile_is_not_replaced(
+    store: MapStore, written: Written, sample_map: Map, tmp_path: Path
+) -> None:
+    pieces = written("home"), written("home-2"), written("home-3")
+    folder = tmp_path / "other"
+    folder.mkdir()
+    version = write_content(folder, content_of(sample_map), "home-3")
+    store.publish(folder, "home-3", version)
+    with pytest.raises(Conflict) as caught:
+        publish(store, *pieces)
+    assert caught.value.code == "map.exists"
+    assert in_use(store) == {"home-3": version}
+    assert store.versions("home-2") == []
+
+
+def test_a_folder_without_versions_is_no_piece(store: MapStore, written: Written) -> None:
+    """As a copy of a map leaves it that was interrupted, or somebody who deletes files by hand."""
+    publish(store, written("home"))
+    broken = store.root / "home-2"
+    broken.mkdir()
+    (broken / "current").write_text("20260101T000000.000Z-00000000\n")
+    again = written("home"), written("home-2")
+    publish(store, *again)
+    assert in_use(store) == {one.map_id: one.version for one in again}
 
 
 @pytest.mark.parametrize("map_id", ["a" * 61, "-home", ""])

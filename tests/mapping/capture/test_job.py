@@ -76,3 +76,13 @@ def test_photos_that_do_not_join_are_refused_with_what_to_film_and_what_was_left
     assert "overlaps the next" in str(refused.value)
     assert "--pairs" not in str(refused.value)
     assert any("broken.jpg" in note for note in refused.value.__notes__)
+
+
+def test_an_id_without_room_for_pieces_is_refused_before_the_long_work(
+    make_video: Callable[..., Path], tmp_path: Path, monkeypatch: Any
+) -> None:
+    settings = CaptureSettings([make_video(panned(20, 12))], "a" * 61, tmp_path / "maps")
+    monkeypatch.setattr(job, "study_videos", lambda *_: pytest.fail("the video is read"))
+    with pytest.raises(InvalidInput) as refused:
+        capture_map(settings, quiet, quiet)
+    assert refused.value.code == "map.id"

@@ -114,6 +114,20 @@ def test_photos_of_a_camera_in_doubt_find_none() -> None:
     assert late_in(photos, looks, matches, doubted).rows == ()
 
 
+def test_a_photo_that_no_pair_fits_finds_none() -> None:
+    """Its landmarks would be made of the matches of pairs, of which each is mostly wrong."""
+    photos, looks, matches, model = walk()
+    random = np.random.default_rng(1)
+    mostly_wrong = []
+    for pair in (p for p in matches if p.second == NUM_PLACED):
+        rows, wrong = pair.rows.copy(), random.random(len(pair.rows)) < 0.58
+        rows[wrong, 1] = random.integers(0, NUM_POINTS, wrong.sum())
+        mostly_wrong.append(replace(pair, rows=rows))
+    late = late_in(photos, looks, mostly_wrong, model)
+    assert (late.rows, late.matches) == ((), ())
+    assert late.views == model.views
+
+
 def test_a_model_with_all_photos_gets_none() -> None:
     photos, looks, _, model = walk()
     late = late_in(photos[:NUM_PLACED], looks, [], replace(model, views=model.views[:NUM_PLACED]))
