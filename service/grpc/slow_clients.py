@@ -96,7 +96,8 @@ class Waiting:
             if len(self._calls) >= self._most:
                 longest = next(iter(self._calls))
                 del self._calls[longest]
-                longest.reschedule(asyncio.get_running_loop().time())
+                if not longest.expired():  # else its time was over just now
+                    longest.reschedule(asyncio.get_running_loop().time())
             self._calls[call] = None
             try:
                 yield
