@@ -7,6 +7,7 @@ absent, the version is told by the shape of ``sensorReadings``. Writing is stric
 from __future__ import annotations
 
 import math
+from codecs import BOM_UTF8
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal, Self
 
@@ -146,7 +147,8 @@ class GeoPoseRequest(_Read):
         """
         check_json_values(text, MAX_INSTANT_VALUES)
         try:
-            body = from_json(text, allow_inf_nan=False)
+            # Some writers begin with a byte order mark, which readers may ignore (RFC 8259).
+            body = from_json(text.removeprefix(BOM_UTF8), allow_inf_nan=False)
         except ValueError:
             raise refuse("request.malformed", expected="JSON") from None
         check_names(text)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from google.protobuf.message import Message
@@ -13,8 +13,6 @@ from visloc.errors import VislocError, inside, refuse
 from visloc.types import Near
 from visloc_api.v1 import localization_pb2 as pb2
 from visloc_api.words import near, sequences
-from visloc_api.words.json_text import check_num_values
-from visloc_api.words.message import MAX_INSTANT_VALUES
 from visloc_api.words.photo import LocalizeRequest
 from visloc_api.words.rigs import BatchLimits, LocalizeRigRequest
 
@@ -111,33 +109,7 @@ def _plain(message: Message) -> dict[str, Any]:
     """Return a message's fields as JSON would have them; fields that are not there are left out.
 
     Numbers, texts and lists without presence are there when they are zero or empty.
-
-    Raises:
-        TooLarge: ``request.too_large`` for too many values, before any is looked at.
     """
-    check_num_values(_num_values(message, MAX_INSTANT_VALUES), MAX_INSTANT_VALUES)
-    return _plain_fields(message)
-
-
-def _num_values(message: Message, enough: int) -> int:
-    """Count the elements of lists and maps, of its parts too; stops once there are ``enough``."""
-    count = 0
-    for _, value in message.ListFields():
-        parts: Iterable[Any] = (value,)
-        if isinstance(value, Mapping):
-            count, parts = count + len(value), value.values()
-        elif isinstance(value, Sequence) and not isinstance(value, str | bytes):
-            count, parts = count + len(value), value
-        for part in parts:
-            if count > enough:
-                return count
-            if not isinstance(part, Message):
-                break  # all are of one kind
-            count += _num_values(part, enough - count)
-    return count
-
-
-def _plain_fields(message: Message) -> dict[str, Any]:
     plain = {
         _RIG_NAMES.get(field.name, field.name): _plain_value(getattr(message, field.name))
         for field in message.DESCRIPTOR.fields
@@ -158,7 +130,7 @@ def _is_there(message: Message, name: str) -> bool:
 
 def _plain_value(value: Any) -> object:
     if isinstance(value, Message):
-        return _plain_fields(value)
+        return _plain(value)
     if isinstance(value, Mapping):
         return {name: _plain_value(value[name]) for name in sorted(value)}
     if isinstance(value, Sequence) and not isinstance(value, str | bytes):

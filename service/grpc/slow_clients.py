@@ -14,7 +14,7 @@ from service.errors import too_slow
 from service.grpc.calls import Handler, behaviour_of, handler_like
 from service.grpc.connections import GrpcConnections
 from service.grpc.envelope import Context, Envelope
-from service.grpc.wire_format import num_fields
+from service.grpc.wire_format import num_values
 from service.settings import SLOWEST_BYTES_PER_S
 from visloc.errors import InvalidInput, TimedOut, TooLarge, VislocError, refuse
 from visloc_api.words.json_text import check_num_values
@@ -96,7 +96,8 @@ class Waiting:
             if len(self._calls) >= self._most:
                 longest = next(iter(self._calls))
                 del self._calls[longest]
-                longest.reschedule(asyncio.get_running_loop().time())
+                if not longest.expired():  # else its time was over just now
+                    longest.reschedule(asyncio.get_running_loop().time())
             self._calls[call] = None
             try:
                 yield
@@ -120,8 +121,8 @@ def readable_or_not(parse: Callable[[bytes], Any] | None) -> Callable[[bytes], A
             return message
         try:
             if kind is not None:
-                fields = num_fields(message, kind.DESCRIPTOR, MAX_INSTANT_VALUES + 1)
-                check_num_values(fields, MAX_INSTANT_VALUES)
+                values = num_values(message, kind.DESCRIPTOR, MAX_INSTANT_VALUES + 1)
+                check_num_values(values, MAX_INSTANT_VALUES)
             return parse(message)
         except DecodeError as error:
             return _Unreadable(_malformed(str(error)))

@@ -19,25 +19,25 @@ from visloc.errors import VislocError, refuse
 
 # Of a request: several times what the longest keys and ids need.
 _MAX_HEAD_BYTES = 16 * 1024
-# Pieces in which any body may come. More must have so many bytes each, on average: h11 takes five
-# microseconds for a piece, on the event loop.
-_FREE_PIECES, _LEAST_PIECE_BYTES = 2000, 64
+# Chunks in which any body may come. More must have so many bytes each, on average: h11 takes five
+# microseconds for a chunk, on the event loop. Packets cost their sender as much.
+_FREE_CHUNKS, _LEAST_CHUNK_BYTES = 2000, 64
 
 
-class LargePieces(h11.Connection):
+class LargeChunks(h11.Connection):
     """HTTP/1.1 of a server that does not take bodies in very many chunks of a few bytes."""
 
-    _pieces = _bytes = 0
+    _chunks = _bytes = 0
 
     def next_event(self) -> h11.Event | type[h11.NEED_DATA] | type[h11.PAUSED]:
-        """Return the next event; too many small pieces are an error of the client like others."""
+        """Return the next event; too many small chunks are an error of the client like others."""
         event = super().next_event()
         if isinstance(event, h11.Request):
-            self._pieces = self._bytes = 0
+            self._chunks = self._bytes = 0
         elif isinstance(event, h11.Data):
-            self._pieces += 1
+            self._chunks += event.chunk_start
             self._bytes += len(event.data)
-            if self._pieces > _FREE_PIECES + self._bytes // _LEAST_PIECE_BYTES:
+            if self._chunks > _FREE_CHUNKS + self._bytes // _LEAST_CHUNK_BYTES:
                 raise h11.RemoteProtocolError("too many small chunks")
         return event
 
@@ -60,7 +60,7 @@ class TimelyProtocol(H11Protocol, Connection):
 
     def __init__(self, config: uvicorn.Config, *args: Any, **kwargs: Any) -> None:
         super().__init__(config, *args, **kwargs)
-        self.conn = LargePieces(h11.SERVER, _MAX_HEAD_BYTES)
+        self.conn = LargeChunks(h11.SERVER, _MAX_HEAD_BYTES)
 
     def send_400_response(self, msg: str) -> None:
         if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):

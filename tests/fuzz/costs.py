@@ -34,7 +34,7 @@ from service.grpc.messages import rig_job_of
 from service.grpc.slow_clients import readable_or_not
 from service.http.bodies import max_sequence_values
 from service.http.forms import FormLimits, parse_form
-from service.http.slow_clients import LargePieces
+from service.http.slow_clients import LargeChunks
 from service.settings import ServiceSettings
 from tests.fuzz.images import Images
 from visloc.archive.packed import unpack_map
@@ -207,7 +207,7 @@ def _unpacked(data: bytes) -> None:
 
 
 def _head_and_body(data: bytes) -> None:
-    connection = LargePieces(h11.SERVER, 16 * 1024)
+    connection = LargeChunks(h11.SERVER, 16 * 1024)
     for start in range(0, len(data), 2**18):
         connection.receive_data(data[start : start + 2**18])
         while connection.next_event() not in (h11.NEED_DATA, h11.PAUSED):

@@ -76,6 +76,7 @@ def is_worth_guiding(problem: Problem, refusal: Refusal) -> bool:
         and len(problem.shown) == 1
         and problem.shown[0] is not None
         and options.preset == DEFAULT_PRESET
+        and options.max_error_px is None
         and options.registration.min_inliers <= as_usual.min_inliers
         and options.registration.min_inlier_ratio <= as_usual.min_inlier_ratio
     )
@@ -140,12 +141,15 @@ def guided_matches(
     distances, near = map(
         np.asarray,
         tree.query(
-            expected.pixels, k=range(1, _NUM_KEYPOINTS + 1), distance_upper_bound=max_error_px
+            expected.pixels, k=range(1, _NUM_KEYPOINTS + 2), distance_upper_bound=max_error_px
         ),
     )
     compared = np.flatnonzero(np.isfinite(distances[:, 0]))
     if len(compared) < _FEWEST:
         return None
+    # Where more are near than are compared, these lie in the smaller disc up to the next one.
+    radii = np.minimum(distances[compared, -1], max_error_px)
+    distances, near = distances[:, :-1], near[:, :-1]
     distances, points = distances[compared], expected.points[compared]
     there = np.isfinite(distances)
     near = np.where(there, near[compared], 0)
@@ -161,7 +165,7 @@ def guided_matches(
     order = order[similarity[order] > np.quantile(chance, _CHANCE)]
     _, first = np.unique(keypoints[order], return_index=True)  # of each keypoint, the most similar
     chosen = order[first]
-    scores = score(distances[rows, column][chosen] / max_error_px)
+    scores = score(distances[rows, column][chosen] / radii[chosen])
     support = float(scores.sum() / max(np.sqrt(np.sum(scores * scores)), 1.0))
     pixels = shown.keypoints[keypoints[chosen]].astype(np.float64)
     return Guided(pixels, points[chosen], support)

@@ -9,6 +9,8 @@ from __future__ import annotations
 import base64
 import binascii
 import json
+from collections.abc import Iterable, Sequence
+from typing import AnyStr
 
 from visloc.errors import refuse
 
@@ -104,18 +106,24 @@ def _shortened(text: str | bytes) -> str | bytes:
     """Return JSON with numbers in the place of long texts: equal ones for equal texts.
 
     Between two quotes without a backslash, a comma, and a colon lies the inside of a text, for
-    what separates two texts has one of the latter. So nothing but texts is replaced.
+    what separates two texts has one of the latter. So nothing but texts is replaced. What comes
+    before the first quote and after the last is no text, though it may be long: spaces.
     """
     if isinstance(text, str):
-        return '"'.join(
-            str(hash(part))
-            if len(part) >= _LONG and not any(mark in part for mark in "\\,:")
-            else part
-            for part in text.split('"')
-        )
-    return b'"'.join(
-        b"%d" % hash(part)
-        if len(part) >= _LONG and not any(mark in part for mark in (b"\\", b",", b":"))
-        else part
-        for part in text.split(b'"')
-    )
+        parts = text.split('"')
+        for place, part in _long_texts(parts, "\\,:"):
+            parts[place] = str(hash(part))
+        return '"'.join(parts)
+    pieces = text.split(b'"')
+    for place, piece in _long_texts(pieces, (b"\\", b",", b":")):
+        pieces[place] = b"%d" % hash(piece)
+    return b'"'.join(pieces)
+
+
+def _long_texts(parts: Sequence[AnyStr], marks: Iterable[AnyStr]) -> list[tuple[int, AnyStr]]:
+    """Return places and parts that are long and have none of the marks, between two others."""
+    return [
+        (place, part)
+        for place, part in enumerate(parts[1:-1], 1)
+        if len(part) >= _LONG and not any(mark in part for mark in marks)
+    ]

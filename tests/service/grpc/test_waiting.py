@@ -43,3 +43,24 @@ def test_a_message_that_does_not_come_is_not_waited_for_longer() -> None:
 
     with pytest.raises(TimeoutError):
         asyncio.run(play())
+
+
+def test_a_call_whose_time_is_over_just_now_does_not_fail_the_one_that_takes_its_place() -> None:
+    async def play() -> None:
+        waiting = Waiting(1)
+
+        async def call(patience_s: float) -> None:
+            async with waiting.place(patience_s):
+                await asyncio.sleep(60)
+
+        over = asyncio.create_task(call(0.0))
+        loop, calls = asyncio.get_running_loop(), list[asyncio.Task[None]]()
+        # In the turn in which the first one's time is over, before it can give its place back.
+        loop.call_soon(lambda: calls.append(asyncio.create_task(call(60.0))))
+        for _ in range(5):
+            await asyncio.sleep(0)
+        assert isinstance(over.exception(), TimeoutError)
+        assert not calls[0].done()
+        calls[0].cancel()
+
+    asyncio.run(play())

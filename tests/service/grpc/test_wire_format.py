@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.grpc.wire_format import num_fields
+from service.grpc.wire_format import num_values
 from visloc_api.v1 import localization_pb2 as pb2
 
 RIG = pb2.LocalizeRigRequest.DESCRIPTOR
@@ -22,26 +22,32 @@ def test_fields_are_counted_also_within_messages() -> None:
     message.images.add()
     camera = message.calibration.sensors["left"].camera  # an entry has a key and a value
     camera.width = 640
-    camera.params.extend([1.0, 2.0, 3.0])  # packed: one field
+    camera.params.extend([1.0, 2.0, 3.0])  # packed: one field, with three numbers
 
-    # map, 2 maps, 2 images with 2 fields in one; calibration, entry, key, value, camera, 2.
-    assert num_fields(message.SerializeToString(), RIG, ENOUGH) == 1 + 2 + 4 + 7
+    # map, 2 maps, 2 images with 2 fields in one; calibration, entry, key, value, camera, 2; 3.
+    assert num_values(message.SerializeToString(), RIG, ENOUGH) == 1 + 2 + 4 + 7 + 3
 
 
 @pytest.mark.parametrize("unit", [IMAGE + b"\0", MAPS + b"\0", b"\xf8\x7f\0", b"\x0d1234"])
 def test_counting_stops_when_there_are_enough(unit: bytes) -> None:
-    assert num_fields(unit * 100_000, RIG, ENOUGH) == ENOUGH
-    assert num_fields(CALIBRATION + b"\xff\xff\x03" + unit * 100_000, RIG, ENOUGH) >= 1
+    assert num_values(unit * 100_000, RIG, ENOUGH) == ENOUGH
+    assert num_values(CALIBRATION + b"\xff\xff\x03" + unit * 100_000, RIG, ENOUGH) >= 1
+
+
+def test_numbers_of_a_byte_each_are_counted() -> None:
+    message = pb2.LocalizeRequest()
+    message.features.keypoints.shape.extend([0] * 5000)
+    assert num_values(message.SerializeToString(), message.DESCRIPTOR, ENOUGH) > 5000
 
 
 def test_bytes_are_not_looked_into() -> None:
     message = pb2.LocalizeRequest(image=MAPS + b"\0" * 1000)
-    assert num_fields(message.SerializeToString(), message.DESCRIPTOR, ENOUGH) == 1
+    assert num_values(message.SerializeToString(), message.DESCRIPTOR, ENOUGH) == 1
 
 
 @given(st.binary(max_size=200))
 def test_whatever_comes_is_counted(data: bytes) -> None:
-    assert 0 <= num_fields(data, RIG, ENOUGH) <= len(data)
+    assert 0 <= num_values(data, RIG, ENOUGH) <= len(data)
 
 
 def test_a_type_may_be_within_itself() -> None:
@@ -53,4 +59,4 @@ def test_a_type_may_be_within_itself() -> None:
         value = value.list_value.values[0]
     outer = Value()
     outer.list_value.values.add().list_value.values.add().number_value = 1.0
-    assert num_fields(outer.SerializeToString(), Value.DESCRIPTOR, ENOUGH) == 5
+    assert num_values(outer.SerializeToString(), Value.DESCRIPTOR, ENOUGH) == 5

@@ -282,6 +282,10 @@ def test_what_is_no_json_or_too_much_of_it_is_refused(text: bytes, code: str) ->
     assert caught.value.code == code
 
 
+def test_a_request_may_begin_with_a_byte_order_mark() -> None:
+    assert GeoPoseRequest.read_json(b'\xef\xbb\xbf{"timestamp": 1}').timestamp == 1
+
+
 def test_ids_and_times_that_are_none_are_left_out() -> None:
     def read(**given: Any) -> GeoPoseRequest:
         return GeoPoseRequest.read_json(json.dumps(given).encode())

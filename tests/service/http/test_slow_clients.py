@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from typing import Any
 
+import h11
 import httpx
 import pytest
 import uvicorn
@@ -20,7 +21,7 @@ from uvicorn.server import ServerState
 
 from service.http.acceptor import Acceptor, OpenConnections
 from service.http.responses import problem_response
-from service.http.slow_clients import Arrivals, http_protocol
+from service.http.slow_clients import Arrivals, LargeChunks, http_protocol
 from service.settings import SLOWEST_BYTES_PER_S
 from visloc.errors import VislocError
 
@@ -265,6 +266,18 @@ def test_a_body_in_many_chunks_is_read(
         chunk = b"%x\r\n%b\r\n" % (size, b"x" * size)
         connection.sendall(CHUNKED % b"read" + chunk * number + b"0\r\n\r\n")
         assert one_answer(connection).endswith(f"{number * size} {number * size}".encode())
+
+
+def test_a_body_in_many_packets_is_read() -> None:
+    """Of a small device that writes a few bytes at a time."""
+    connection = LargeChunks(h11.SERVER)
+    connection.receive_data(head("/read", 20_000))
+    connection.next_event()
+    for _ in range(5000):
+        connection.receive_data(b"1234")
+        event = connection.next_event()
+        assert isinstance(event, h11.Data)
+        assert bytes(event.data) == b"1234"
 
 
 def test_what_is_no_http_after_an_answer_leaves_no_traceback(

@@ -89,6 +89,18 @@ def test_a_photo_that_looks_like_something_else_gives_no_support(localizer: Loca
     assert guided(localizer, other, pose).support < 4.0
 
 
+def test_very_many_keypoints_give_no_support(localizer: Localizer) -> None:
+    """The nearest of them all lie in the middle of the disc in which a landmark is looked for."""
+    shown, view, pose = shown_at(localizer)
+    random = np.random.default_rng(0)
+    rows = np.tile(shown.descriptors.rows, (20_000 // len(shown.keypoints), 1))
+    size = view.camera.width, view.camera.height
+    keypoints = random.uniform((0, 0), size, (len(rows), 2)).astype(np.float32)
+    crowded = Shown(keypoints, EightBitRows(random.permutation(rows), shown.descriptors.scale))
+    for degrees in (0.0, 9.0, 15.0):
+        assert guided(localizer, crowded, turned(pose, degrees)).support < 4.0
+
+
 def doubtful(localizer: Localizer, num_right: int) -> tuple[Problem, Proposed, Pose]:
     """A photo of which so many matches are right, and two thousand wrong."""
     shown, view, pose = shown_at(localizer)
@@ -149,6 +161,7 @@ def test_only_single_photos_with_default_thresholds_are_guided(localizer: Locali
     assert not is_worth_guiding(replace(problem, shown=()), FEW)
     for options in (
         LocalizeOptions(preset="config1"),
+        LocalizeOptions(max_error_px=40),
         LocalizeOptions(min_inliers=50),
         LocalizeOptions(min_inlier_ratio=0.1),
     ):

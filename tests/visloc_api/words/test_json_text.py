@@ -42,6 +42,14 @@ def test_a_name_twice_is_found_beside_long_texts(text: str, as_text: type) -> No
     assert caught.value.code == "request.duplicate_field"
 
 
+@pytest.mark.parametrize("text", ['{"a": "b"}', '["a"]'])
+def test_json_may_have_many_spaces_around_it(text: str) -> None:
+    spaces = " " * 2000
+    for padded in (spaces + text, text + spaces, text[:-1] + spaces + text[-1:]):
+        check_names(padded)
+        check_names(padded.encode())
+
+
 def test_long_names_that_differ_at_their_end_are_two() -> None:
     check_names(f'{{"{LONG}a": 1, "{LONG}b": 2}}')
 
