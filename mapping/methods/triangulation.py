@@ -14,7 +14,7 @@ import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
 import pycolmap
 
 from mapping.methods.adjustment import adjusted_robustly, error_rises, refine_model
-from mapping.methods.colmap_calls import interruptible
+from mapping.methods.colmap_calls import interruptible, quiet
 from mapping.methods.colmap_scene import ColmapScene, Rigs, colmap_database
 from mapping.methods.intrinsics import (
     Doubt,
@@ -257,18 +257,19 @@ def _map_incrementally(
         folder.mkdir(exist_ok=True)
         begun.write(folder)
         placed.count = begun.num_reg_images()
-    return interruptible(
-        lambda token: pycolmap.incremental_mapping(
-            path,
-            path.parent,
-            path.parent,
-            options=options,
-            input_path="" if begun is None else folder,
-            initial_image_pair_callback=placed.first_pair,
-            next_image_callback=placed.one_more,
-            cancellation_token=token,
+    with quiet(errors=False):  # that there is no model is not always an error
+        return interruptible(
+            lambda token: pycolmap.incremental_mapping(
+                path,
+                path.parent,
+                path.parent,
+                options=options,
+                input_path="" if begun is None else folder,
+                initial_image_pair_callback=placed.first_pair,
+                next_image_callback=placed.one_more,
+                cancellation_token=token,
+            )
         )
-    )
 
 
 def solve_with_priors(
