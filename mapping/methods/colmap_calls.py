@@ -40,10 +40,10 @@ def interruptible(run: Callable[[pycolmap.CancellationToken], T]) -> T:
 
 
 @contextmanager
-def quiet() -> Iterator[None]:
-    """Let pycolmap report errors only."""
+def quiet(*, errors: bool = True) -> Iterator[None]:
+    """Let pycolmap print errors only; or nothing, where what it returns tells of an error."""
     before: Any = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = 2
+    pycolmap.logging.minloglevel = 2 if errors else 3
     try:
         yield
     finally:

@@ -14,7 +14,7 @@ import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
 import pycolmap
 
 from mapping.methods.adjustment import adjusted_robustly, error_rises, refine_model
-from mapping.methods.colmap_calls import interruptible
+from mapping.methods.colmap_calls import interruptible, quiet
 from mapping.methods.colmap_scene import ColmapScene, Rigs, colmap_database
 from mapping.methods.intrinsics import (
     Doubt,
@@ -25,7 +25,6 @@ from mapping.methods.intrinsics import (
 )
 from mapping.methods.look_alikes import without_look_alikes
 from mapping.methods.matching import Matches
-from mapping.methods.misplaced import misplaced
 from mapping.methods.points import triangulate_points
 from mapping.methods.sparse_model import MapperConfig, SfmPhoto, SparseModel, without_bad_points
 from mapping.methods.thinning import thin
@@ -34,6 +33,9 @@ from visloc.errors import VislocError, refuse
 
 # Stages of a build.
 MAPPING, TRIANGULATION = "incremental mapping", "triangulation"
+# Least angle between the rays of the two photos that the mapper begins with, in the median. With
+# COLMAP's 16 degrees they may be far apart and share few matches; what they make places others.
+_FIRST_ANGLE_DEG = 4.0
 # After so many models that put cameras in doubt, no camera with a prior is refined any more.
 _MAX_JUDGEMENTS = 3
 
@@ -98,8 +100,7 @@ def reconstruct(
         InvalidInput: ``sfm.no_matches``, ``sfm.no_model``, ``sfm.camera``, ``sfm.no_points``.
     """
     matches = without_look_alikes(photos, matches)
-    thinned = thin(photos, matches)
-    with colmap_database(photos, rigs, thinned, work) as (path, scene):
+    with colmap_database(photos, rigs, thin(photos, matches), work) as (path, scene):
         known = {photo.sensor for photo in photos if photo.camera_known}
         constant = set() if "intrinsics" in refine else known
         placed = _Placed(len(photos), partial(progress, MAPPING))
@@ -124,13 +125,6 @@ def reconstruct(
         result, doubts = solve_with_priors(solve, scene, photos, refined, poses=True)
         sure = {scene.camera_ids[sensor] for sensor in refined - doubts.keys()}
         result = adjusted_robustly(result, sure)
-
-        def go_on(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction | None:
-            models = _map_incrementally(path, options_with(doubts), placed, model)
-            largest = max(models.values(), key=lambda m: m.num_reg_images(), default=None)
-            return None if largest is None else adjusted_robustly(largest, sure)
-
-        result = _with_misplaced_again(result, go_on, scene, photos, thinned, config)
         found = scene.read(result, photos, ("poses", "intrinsics"), doubts)
     progress(MAPPING, len(photos), len(photos))
     return _with_all_points(
@@ -157,37 +151,6 @@ def _no_model(
         expected="photos that overlap; see --pairs and --mapper",
         got=f"{len(photos)} photos, {len(matches)} pairs with verified matches",
     )
-
-
-def _with_misplaced_again(
-    model: pycolmap.Reconstruction,
-    go_on: Callable[[pycolmap.Reconstruction], pycolmap.Reconstruction | None],
-    scene: ColmapScene,
-    photos: Sequence[SfmPhoto],
-    matches: Sequence[Matches],
-    config: MapperConfig,
-) -> pycolmap.Reconstruction:
-    """Place the photos that a model contradicts once more, if it becomes better by that.
-
-    Args:
-        go_on: maps incrementally from a model on; None without success.
-    """
-
-    def judge(judged: pycolmap.Reconstruction) -> tuple[list[int], float]:
-        views = scene.read(judged, photos, ("poses", "intrinsics"), {}).views
-        return misplaced(photos, views, matches, config.filter_max_reproj_error)
-
-    rows, share = judge(model)
-    if not rows:
-        return model
-    rest = pycolmap.Reconstruction(model)
-    frames = {rest.image(scene.images[row].image_id).frame_id for row in rows}
-    for frame in frames:
-        rest.deregister_frame(frame)
-    again = go_on(rest)
-    if again is None or again.num_reg_images() < model.num_reg_images():
-        return model
-    return again if judge(again)[1] > share else model
 
 
 def _with_all_points(
@@ -245,30 +208,22 @@ class _Placed:
 
 
 def _map_incrementally(
-    path: Path,
-    options: pycolmap.IncrementalPipelineOptions,
-    placed: _Placed,
-    begun: pycolmap.Reconstruction | None = None,
+    path: Path, options: pycolmap.IncrementalPipelineOptions, placed: _Placed
 ) -> dict[int, pycolmap.Reconstruction]:
     if not options.image_names:  # pycolmap would take all photos
         return {}
-    folder = path.parent / "begun"
-    if begun is not None:
-        folder.mkdir(exist_ok=True)
-        begun.write(folder)
-        placed.count = begun.num_reg_images()
-    return interruptible(
-        lambda token: pycolmap.incremental_mapping(
-            path,
-            path.parent,
-            path.parent,
-            options=options,
-            input_path="" if begun is None else folder,
-            initial_image_pair_callback=placed.first_pair,
-            next_image_callback=placed.one_more,
-            cancellation_token=token,
+    with quiet(errors=False):  # that there is no model is not always an error
+        return interruptible(
+            lambda token: pycolmap.incremental_mapping(
+                path,
+                path.parent,
+                path.parent,
+                options=options,
+                initial_image_pair_callback=placed.first_pair,
+                next_image_callback=placed.one_more,
+                cancellation_token=token,
+            )
         )
-    )
 
 
 def solve_with_priors(
@@ -365,6 +320,7 @@ def pipeline_options(config: MapperConfig) -> pycolmap.IncrementalPipelineOption
     mapper, triangulation = options.mapper, options.triangulation
     mapper.random_seed = triangulation.random_seed = 0
     mapper.init_min_num_inliers = config.init_min_num_inliers
+    mapper.init_min_tri_angle = _FIRST_ANGLE_DEG
     mapper.abs_pose_min_num_inliers = config.abs_pose_min_num_inliers
     mapper.abs_pose_min_inlier_ratio = config.abs_pose_min_inlier_ratio
     mapper.abs_pose_max_error = config.abs_pose_max_error

@@ -14,6 +14,7 @@ from mapping.methods.matching import Matches
 from mapping.methods.pieces import MIN_PHOTOS, models_beside
 from mapping.methods.sparse_model import MAPPER_CONFIGS, SfmPhoto, SparseModel
 from mapping.methods.triangulation import reconstruct
+from visloc.errors import InvalidInput
 from visloc.geometry import Camera, Pose
 from visloc.pose.colmap import project
 
@@ -80,3 +81,16 @@ def test_observations_are_of_the_photos_that_they_were_before(
         assert view is not None
         pixels = project(view.camera, view.cam_from_world.apply(other.points[seen.points[own]]))
         np.testing.assert_allclose(pixels, photos[row].keypoints[seen.rows[own]], atol=0.5)
+
+
+def test_that_there_is_no_further_model_prints_nothing(
+    photographed: tuple[list[SfmPhoto], list[Matches]],
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    photos, matches = photographed
+    few = Matches(0, 1, matches[0].rows[: CONFIG.min_num_matches])
+    with pytest.raises(InvalidInput) as refused:
+        make(photos, tmp_path, (matches[0].first, matches[0].second), [few])
+    assert refused.value.code == "sfm.no_model"
+    assert capfd.readouterr() == ("", "")
