@@ -295,7 +295,8 @@ def _decode_avif(opened: AvifImageFile, _reduced: int) -> NDArray[np.uint8] | No
     """
     try:
         pixels = np.frombuffer(opened._decoder.get_frame(0)[0], np.uint8)
-        return pixels.reshape(opened.height, opened.width, -1)[..., :3].copy()
+        pixels = pixels.reshape(opened.height, opened.width, len(opened.mode))  # L, RGB or RGBA
+        return np.repeat(pixels, 3, axis=2) if opened.mode == "L" else pixels[..., :3].copy()
     except MALFORMED:
         return None
 
