@@ -289,9 +289,10 @@ def _decode_with_pillow(opened: ImageFile, _reduced: int) -> NDArray[np.uint8] |
 
 
 def _decode_avif(opened: AvifImageFile, _reduced: int) -> NDArray[np.uint8] | None:
-    """Take the pixels as Pillow's decoder gives them: through ``Image`` they are copied three times.
+    """Take the pixels as Pillow's decoder gives them.
 
-    That would take 11 bytes for each pixel, of which a file of 2 kB may have 50 million.
+    ``Image`` copies them three times, and takes 11 bytes for each pixel. A file of 2 kB may have 50
+    million.
     """
     try:
         pixels = np.frombuffer(opened._decoder.get_frame(0)[0], np.uint8)
