@@ -19,7 +19,7 @@ logger = logging.getLogger(__name__)
 # the connection that was waiting.
 _SHORTAGES = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 # Connections accepted in one turn of the event loop, so that a flood leaves time for requests.
-_BATCH = 64
+_BATCH = 16
 # The time that a new connection has to send a request before it may be closed for the next. A flood
 # waits in the backlog, which is served in order.
 _LEAST_IDLE_S = 0.1
