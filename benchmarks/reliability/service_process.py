@@ -67,7 +67,9 @@ class ServiceProcess:
             **settings,
         }
         flags = [f"--{name.replace('_', '-')}={value}" for name, value in given.items()]
-        self._command = [*before, sys.executable, "-m", "service", *flags]
+        # However the benchmark ends, the service is told to end as well.
+        ends_with_us = ("setpriv", "--pdeathsig", "TERM")
+        self._command = [*before, *ends_with_us, sys.executable, "-m", "service", *flags]
         own = {name: value for name, value in os.environ.items() if "VISLOC" not in name}
         self._environment = own | dict(environment or {})
         self._process: subprocess.Popen[bytes] | None = None

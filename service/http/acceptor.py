@@ -9,8 +9,7 @@ import math
 import socket
 import ssl
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from itertools import chain
+from collections.abc import Callable, Iterator, Mapping
 from time import monotonic
 from typing import Any
 
@@ -20,7 +19,7 @@ logger = logging.getLogger(__name__)
 # the connection that was waiting.
 _SHORTAGES = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 # Connections accepted in one turn of the event loop, so that a flood leaves time for requests.
-_BATCH = 64
+_BATCH = 16
 # The time that a new connection has to send a request before it may be closed for the next. A flood
 # waits in the backlog, which is served in order.
 _LEAST_IDLE_S = 0.1
@@ -55,7 +54,9 @@ class OpenConnections:
     A connection is in use from the end of a request's arrival to the end of its answer. Before, its
     request arrives, from the end of the head on; else it is idle. At the limit, one is closed for a
     new one: the longest idle, and where none is, the one whose request has come no further for the
-    longest time, because a body may come very slowly.
+    longest time, because a body may come very slowly. Where requests that arrive hold most places,
+    they come first: there is always an idle one, the newest, whose head has not been read yet, and
+    the others belong to clients that had their answers.
     """
 
     def __init__(self, limit: int) -> None:
@@ -114,23 +115,21 @@ class OpenConnections:
         """
         if len(self._open) < self.limit:
             return 0.0
-        idlest = self._idlest()
-        if idlest is None:
-            return math.inf
-        since = self._idle.get(idlest) or self._arriving[idlest]
-        wait_s = since + _LEAST_IDLE_S - monotonic()
-        if wait_s > 0:
-            return wait_s
-        self._close(idlest)
-        return 0.0
+        wait_s = math.inf
+        for each, since in self._ranked():
+            wait_s = min(wait_s, since + _LEAST_IDLE_S - monotonic())
+            if wait_s <= 0:
+                self._close(each)
+                return 0.0
+        return wait_s
 
     def close_idle(self, most: int) -> None:
         """Close the longest idle connections."""
         for _ in range(most):
-            idlest = self._idlest()
+            idlest = next(self._ranked(), None)
             if idlest is None:
                 return
-            self._close(idlest)
+            self._close(idlest[0])
 
     def close_unopened(self) -> None:
         """Close the connections that are still in their TLS handshake."""
@@ -138,13 +137,24 @@ class OpenConnections:
             if each.opening is not None and not each.opening.done():
                 self._close(each)
 
-    def _idlest(self) -> Connection | None:
-        waiting = chain(self._idle, self._arriving)
-        return next((each for each in waiting if not each.is_sending), None)
+    def _ranked(self) -> Iterator[tuple[Connection, float]]:
+        """Give what may be closed, the best first, and since when it has waited."""
+        idle, arriving = _longest(self._idle), _longest(self._arriving)
+        if arriving is not None and 2 * len(self._arriving) > self.limit:
+            yield arriving
+        if idle is not None:
+            yield idle
+        elif arriving is not None:
+            yield arriving
 
     def _close(self, connection: Connection) -> None:
         self.remove(connection)
         connection.abandon()
+
+
+def _longest(waiting: Mapping[Connection, float]) -> tuple[Connection, float] | None:
+    """Return the first that has nothing to send, and since when it has waited."""
+    return next((each for each in waiting.items() if not each[0].is_sending), None)
 
 
 class Acceptor:

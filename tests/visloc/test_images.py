@@ -553,6 +553,16 @@ def test_a_photo_of_boxes_that_is_cut_off_is_refused(file_format: str, kept: flo
     assert refusal(data[: int(len(data) * kept)]).code == "image.undecodable"
 
 
+@pytest.mark.parametrize("mode", ["L", "RGB", "RGBA"])
+def test_avif_of_every_kind_of_pixels_reads_as_pillow_shows_it(mode: str) -> None:
+    data = encode(Image.fromarray(texture()).convert(mode), "AVIF")
+
+    photo = read_photo(data)
+
+    np.testing.assert_array_equal(photo.rgb, Image.open(io.BytesIO(data)).convert("RGB"))
+    assert photo.rgb.flags.writeable
+
+
 @pytest.mark.parametrize("declared", [(48, 34), (8, 8), (4000, 4000)])
 def test_a_heic_photo_of_another_size_than_it_declares_is_refused(
     declared: tuple[int, int],
@@ -664,7 +674,7 @@ def test_a_tiff_of_floats_is_refused() -> None:
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")  # Pillow's, about what it finds
-@pytest.mark.parametrize("file_format", ["JPEG", "PNG", "WEBP", "TIFF", "BMP"])
+@pytest.mark.parametrize("file_format", ["JPEG", "PNG", "WEBP", "AVIF", "TIFF", "BMP"])
 def test_damaged_files_are_read_or_refused_and_nothing_else(file_format: str) -> None:
     data = encode(
         Image.fromarray(texture()),

@@ -231,6 +231,24 @@ def test_a_request_that_does_not_come_on_is_closed_when_none_is_idle(
     assert connections.make_room() == float("inf")
 
 
+def test_bodies_that_hold_most_places_give_way_before_those_between_two_requests() -> None:
+    answered, *slow = [Talk() for _ in range(5)]
+    connections = OpenConnections(5)
+    connections.add(answered)
+    for talk in slow:
+        connections.add(talk)
+        connections.note(talk, in_use=False, arriving=True)
+    time.sleep(2 * connections.make_room())  # a body that has just begun has its time too
+
+    for closed in (slow[:1], slow[:2]):
+        assert connections.make_room() == 0
+        assert [talk for talk in slow if talk.was_closed] == closed
+        connections.add(Talk())  # its head has not been read: nobody waits for it
+    assert connections.make_room() == 0
+    assert answered.was_closed  # bodies are the fewer now
+    assert not any(talk.was_closed for talk in slow[2:])
+
+
 def test_a_new_connection_has_time_to_send_a_request() -> None:
     connections = OpenConnections(1)
     new = Talk()
