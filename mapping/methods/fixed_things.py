@@ -9,8 +9,8 @@ does what lies in the direction of the motion: both fit the geometry of the othe
 fit it speaks against its cell of the picture, and others that fit speak for theirs. A cell that
 more matches of several pairs speak against than for is masked.
 
-Beside a camera that stands still while people walk by, the people are the others. But then no cell
-is left that matches speak for, as they walk on, and nothing is masked.
+Before a camera that stands still while people walk by, the people are the others. But then hardly a
+cell is left that matches speak for alone, as they walk on, and nothing is masked.
 """
 
 from __future__ import annotations
@@ -35,8 +35,9 @@ _STILL_SHARE, _STILL_PX = 0.0025, 1.5
 _LEAST_STILL, _LEAST_MOVED = 8, 15
 # A cell is masked when so many pairs speak against it, by so many times more matches than for it.
 _LEAST_PAIRS, _TIMES = 4, 2.0
-# Nothing is masked unless so large a part of the cells that matches tell of stays.
-_LEAST_STAYS = 0.25
+# Nothing is masked unless matches speak for so large a part of the cells that they tell of, by so
+# many times more than against.
+_LEAST_FREE, _TIMES_FREE = 0.25, 5.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,8 +99,9 @@ class Tally:
     def mask(self) -> Mask | None:
         """Return the cells that show something fixed to the picture, if any do."""
         fixed = (self.pairs >= _LEAST_PAIRS) & (self.against > _TIMES * self.moved)
-        told = fixed | (self.moved > self.against)
-        if not fixed.any() or (told & ~fixed).sum() < _LEAST_STAYS * told.sum():
+        free = self.moved > _TIMES_FREE * self.against
+        told = self.moved + self.against > 0
+        if not fixed.any() or free.sum() < _LEAST_FREE * told.sum():
             return None
         # Few matches tell of cells between others that are masked: they show the same thing.
         return np.asarray(binary_closing(np.pad(fixed, 1), np.ones((3, 3), dtype=bool))[1:-1, 1:-1])

@@ -46,6 +46,22 @@ def test_too_few_matches_do_not_fit(count: int, calibrated: bool) -> None:
     assert fits.tolist() == [False] * count
 
 
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_matches_that_the_pose_is_not_estimated_from_may_fit_it(calibrated: bool) -> None:
+    a, b = two_photos(120, 120)
+    among = np.arange(240) < 90
+    fits = fits_two_views((CAMERA, CAMERA), a, b, 4.0, calibrated=calibrated, among=among)
+    assert fits[:120].mean() > 0.97
+    assert fits[120:].mean() < 0.15
+    # Two motions: what keeps its pixel does not fit the pose of the others, however much it is.
+    still = np.concatenate([a[:90], np.repeat(a[90:120], 10, axis=0)])
+    there = np.concatenate([b[:90], np.repeat(a[90:120], 10, axis=0)])
+    among = np.arange(390) < 90
+    fits = fits_two_views((CAMERA, CAMERA), still, there, 1.0, calibrated=calibrated, among=among)
+    assert fits[:90].mean() > 0.9
+    assert fits[90:].mean() < 0.3
+
+
 def test_pixels_without_a_ray_do_not_fit() -> None:
     camera = Camera("OPENCV", 640, 480, (500.0, 500.0, 320.0, 240.0, -0.9, 0.0, 0.0, 0.0))
     at = np.zeros((50, 2), np.float32)
