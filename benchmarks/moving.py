@@ -1,42 +1,56 @@
-"""Poses from photos of the painted room in which something moves, compared with the true ones.
+"""Maps of the painted room in which something moves, built as users build them.
 
     python -m benchmarks.moving none ahead:0.4 crossing:0.2
 
 ``ahead:WIDTH`` puts a poster of so many metres before the camera, which moves along with it as a
-bonnet or a person who walks ahead does; ``crossing:WIDTH`` one that walks through the room. No
-masks are used. Prints how much of the photos it covers, and how far off the poses are.
+bonnet does; ``crossing:WIDTH`` one that walks through the room. No masks are given. Prints how much
+of the photos it covers, how far off the poses are, what the build noted, and what the map's own
+test says. With ``--poses given`` the build knows the true poses.
 """
 
 from __future__ import annotations
 
-import tempfile
-from itertools import combinations
+import subprocess
+import sys
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated
 
+import cv2
 import numpy as np
 import typer
 
 from mapping.frames.anchor import align_poses
-from mapping.methods.matching import Matches
-from mapping.methods.sparse_model import MAPPER_CONFIGS, SfmPhoto, SparseModel
-from mapping.methods.two_views import fits_two_views
-from mapping.methods.undoing import reconstruct_places
+from mapping.importers import ImportedModel, write_imported
+from mapping.importers.model import ImportedImage
 from samples.render import render_photo
 from samples.scene import Rectangle, Scene, make_room
 from samples.trajectories import mapping_trajectory, stereo_rig
-from visloc.features import make_local_features
+from visloc.archive import Map, MapStore
 from visloc.geometry import Pose
-from visloc.matching.correspondences import mutual_nearest_neighbours
-from visloc.matching.products import round_descriptors
-from visloc.types import LocalFeatures
+from visloc.kapture import Sensor
+from visloc.localization.constraints import MapGeometry
 
-NUM_PHOTOS, SIZE, MAX_KEYPOINTS = 24, (320, 240), 1000
+NUM_PHOTOS, SIZE = 24, (320, 240)
 HEIGHT_M, AHEAD_M, ASIDE_M = 1.7, 1.5, 0.25
 # The path of what walks through the room: an ellipse, walked so often.
 HALF_AXES_M, ROUNDS = (1.2, 0.9), 1.7
 POSTER_SEED = 5
-CONFIG = MAPPER_CONFIGS["config1"]
+OPTIONS = [
+    "--method=sfm",
+    "--pairs=exhaustive",
+    "--local-features=sift",
+    "--global-features=localvlad",
+    "--max-keypoints=1000",
+    "--workers=1",
+]
+
+
+@cache
+def painted() -> Rectangle:
+    """The wall of another room, whose paint the moving thing has."""
+    return max(make_room(POSTER_SEED).rectangles, key=lambda each: each.levels[0].size)
 
 
 def poster_before(pose: Pose, number: int, how: str, width: float) -> Rectangle:
@@ -52,71 +66,78 @@ def poster_before(pose: Pose, number: int, how: str, width: float) -> Rectangle:
         upright = np.array([0.0, 0.0, -1.0])
         along = np.cross(upright, seen / np.linalg.norm(seen))
     u, v = width * along, HEIGHT_M * upright
-    paint = max(make_room(POSTER_SEED).rectangles, key=lambda each: each.levels[0].size)
-    return Rectangle(middle - u / 2 - v / 2, u, v, paint.levels)
+    return Rectangle(middle - u / 2 - v / 2, u, v, painted().levels)
 
 
-def matched(found: list[LocalFeatures]) -> tuple[list[SfmPhoto], list[Matches]]:
-    """Photos, and all their pairs with verified matches."""
-    camera = stereo_rig(*SIZE)["left"].camera
-    photos = [
-        SfmPhoto(f"{row}.jpg", "cam", row, camera, True, None, each.keypoints)
-        for row, each in enumerate(found)
-    ]
-    looks = [round_descriptors(each.descriptors) for each in found]
-    matches = []
-    for a, b in combinations(range(len(photos)), 2):
-        i, j, _ = mutual_nearest_neighbours(looks[a], looks[b])
-        fits = fits_two_views(
-            (camera, camera),
-            photos[a].keypoints[i],
-            photos[b].keypoints[j],
-            CONFIG.filter_max_reproj_error,
-            calibrated=True,
-        )
-        if fits.sum() >= CONFIG.min_num_matches:
-            matches.append(Matches(a, b, np.column_stack([i, j]).astype(np.uint32)[fits]))
-    return photos, matches
+def write_photos(folder: Path, what: str, poses: list[Pose]) -> float:
+    """Write a photo from each pose, and return how much of them the moving thing covers."""
+    camera, room = stereo_rig(*SIZE)["left"].camera, make_room(0)
+    how, _, width = what.partition(":")
+    folder.mkdir()
+    covered = []
+    for number, pose in enumerate(poses):
+        still = photo = render_photo(room, camera, pose)
+        if how != "none":
+            poster = poster_before(pose, number, how, float(width))
+            photo = render_photo(Scene((*room.rectangles, poster)), camera, pose)
+        covered.append(float((photo != still).any(axis=-1).mean()))
+        cv2.imwrite(str(folder / f"{number:02}.png"), photo[..., ::-1])
+    return float(np.mean(covered))
 
 
-def told(what: str, model: SparseModel, poses: list[Pose], covered: float) -> str:
-    """A line about one model."""
-    rows = [row for row, view in enumerate(model.views) if view is not None]
-    found = [view.cam_from_world for view in model.views if view is not None]
-    true = [poses[row] for row in rows]
+def built(folder: Path, poses: list[Pose], given: str) -> Map | None:
+    """Build a map of the photos in a folder; None when nothing was published."""
+    images = tuple(
+        ImportedImage(f"{number:02}.png", "cam", number, pose if given == "given" else None)
+        for number, pose in enumerate(poses)
+    )
+    camera = Sensor.with_camera("cam", stereo_rig(*SIZE)["left"].camera)
+    write_imported(ImportedModel({"cam": camera}, images, folder / "photos"), folder / "dataset")
+    command = [sys.executable, "-c", "from mapping.cli.main import main; main()", "build"]
+    command += [str(folder / "dataset"), "--map=moving", f"--maps-dir={folder / 'maps'}"]
+    done = subprocess.run(
+        [*command, *OPTIONS, f"--poses={given}"], capture_output=True, text=True, check=False
+    )
+    store = MapStore(folder / "maps")
+    if "moving" not in store.ids() and not store.versions("moving"):
+        typer.echo(done.stderr[-500:])
+        return None
+    return store.open(f"moving@{store.versions('moving')[-1]}")
+
+
+def told(opened: Map, true: list[Pose]) -> str:
+    """What a map says of itself, beside how far off its poses are."""
+    viewpoints = MapGeometry(opened).viewpoints
+    found = [viewpoints.pose(row) for row in range(len(opened.images))]
+    true = [true[int(Path(image.name).stem)] for image in opened.images]
     moved = align_poses(found, true)
     centers = np.array([pose.center for pose in true])
     off = np.linalg.norm(moved.apply(np.array([pose.center for pose in found])) - centers, axis=1)
-    return (
-        f"{what} covers {covered:.0%}: {len(rows)} of {len(poses)} photos placed, "
-        f"rms {100 * np.sqrt(np.mean(off**2)):.1f} cm, largest {100 * off.max():.1f} cm"
+    parts = opened.manifest.parts
+    return "\n".join(
+        (
+            f"{len(found)} of {NUM_PHOTOS} photos placed, rms {100 * np.sqrt(np.mean(off**2)):.1f} "
+            f"cm, largest {100 * off.max():.1f} cm",
+            *(f"  note: {note}" for note in opened.manifest.notes),
+            *(f"  doubt {doubt.kind}: {doubt.message}" for doubt in parts.doubts),
+            f"  own test: {parts.own_test}",
+        )
     )
 
 
 def main(
     moving: Annotated[list[str], typer.Argument(help="none, ahead:WIDTH, crossing:WIDTH (metres)")],
+    poses: Annotated[str, typer.Option(help="estimate, or given: the true ones.")] = "estimate",
 ) -> None:
-    """Find poses of photos in which something moves, and compare them with the true ones."""
-    rig = stereo_rig(*SIZE)["left"]
-    poses = [rig.cam_from_rig @ pose for pose in mapping_trajectory(NUM_PHOTOS)]
-    room, sift = make_room(0), make_local_features("sift", threads=1)
+    """Build maps of photos in which something moves, and compare them with the true poses."""
+    mounted = stereo_rig(*SIZE)["left"].cam_from_rig
+    true = [mounted @ pose for pose in mapping_trajectory(NUM_PHOTOS)]
     for what in moving:
-        how, _, width = what.partition(":")
-        found, covered = [], []
-        for number, pose in enumerate(poses):
-            still = photo = render_photo(room, rig.camera, pose)
-            if how != "none":
-                poster = poster_before(pose, number, how, float(width))
-                photo = render_photo(Scene((*room.rectangles, poster)), rig.camera, pose)
-            covered.append(float((photo != still).any(axis=-1).mean()))
-            found.append(sift.extract(photo, max_keypoints=MAX_KEYPOINTS))
-        photos, matches = matched(found)
-        looks = [np.rint(127 * each.descriptors).astype(np.int8) for each in found]
-        with tempfile.TemporaryDirectory() as folder:
-            model = reconstruct_places(
-                photos, looks.__getitem__, {}, matches, CONFIG, (), Path(folder), lambda *_: None
-            )
-        typer.echo(told(what, model, poses, float(np.mean(covered))))
+        with TemporaryDirectory() as folder:
+            covered = write_photos(Path(folder) / "photos", what, true)
+            opened = built(Path(folder), true, poses)
+            said = "no map" if opened is None else told(opened, true)
+        typer.echo(f"{what} covers {covered:.0%}: {said}")
 
 
 if __name__ == "__main__":

@@ -6,12 +6,13 @@ pair is estimated (``mapping.methods.two_views``).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mapping.methods.fixed_things import Mask, Tally, are_masked, some_keep_their_pixel
 from mapping.methods.two_views import fits_two_views
 from mapping.stages.context import BuildContext
 from mapping.stages.landmarks import View
@@ -25,7 +26,10 @@ from visloc.matching.verification import epipolar_errors
 from visloc.pose.colmap import normalized_rays
 
 # Raised when the code of a stage here changes what comes out.
-_REVISION = {"matches": 2, "verified": 2}
+_REVISION = {"matches": 2, "fixed_things": 1, "verified": 3}
+# Partners of a photo with which it is asked what is fixed to the picture: enough for all photos
+# together.
+_MOST_ASKED = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,11 +55,13 @@ class Verification:
         max_error_px: largest distance to the epipolar line, pixels.
         min_matches: fewest verified matches of a pair; a pair with fewer is dropped.
         poses_known: verify with the poses of the photos; otherwise by two-view geometry.
+        fixed: masks of what is fixed to the picture, by sensor. No match there is right.
     """
 
     max_error_px: float
     min_matches: int
     poses_known: bool
+    fixed: Mapping[str, Mask] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,6 +70,29 @@ class _Partners:
 
     photo: MappingPhoto
     partners: tuple[MappingPhoto, ...]
+
+
+def find_fixed(
+    context: BuildContext,
+    photos: Sequence[MappingPhoto],
+    pairs: NDArray[np.int64],
+    verification: Verification,
+) -> dict[str, Mask]:
+    """Match pairs (m, 2) of photos, and find what is fixed to the picture.
+
+    Returns:
+        Masks by sensor, of those that have such things.
+    """
+    partners = [group for _, _, group in _groups(photos, pairs)]
+    task = _MatchTask(context.work, context.features, verification)
+    context.run("matches", task.match_and_tally, partners)
+    tallies: dict[str, Tally] = {}
+    for group in partners:
+        sensor, item = group.photo.record.sensor_id, context.work.read(task.tally_key(group))
+        told = Tally(item["against"], item["pairs"], item["moved"])
+        tallies[sensor] = told + tallies[sensor] if sensor in tallies else told
+    masks = {sensor: tally.mask() for sensor, tally in tallies.items()}
+    return {sensor: mask for sensor, mask in masks.items() if mask is not None}
 
 
 def match_pairs(
@@ -77,14 +106,9 @@ def match_pairs(
     Returns:
         The pairs that have matches, and a key for all their inputs.
     """
-    groups = [
-        (first, pairs[pairs[:, 0] == first, 1].tolist())
-        for first in np.unique(pairs[:, 0]).tolist()
-    ]
-    partners = [
-        _Partners(photos[first], tuple(photos[second] for second in seconds))
-        for first, seconds in groups
-    ]
+    found_groups = _groups(photos, pairs)
+    groups = [(first, seconds) for first, seconds, _ in found_groups]
+    partners = [group for _, _, group in found_groups]
     task = _MatchTask(context.work, context.features, verification)
     context.run("matches", task.match, partners)
     context.run("verified", task.verify, partners)
@@ -96,6 +120,18 @@ def match_pairs(
         if len(rows)
     ]
     return found, key_of("all_matches", 1, keys=keys, groups=groups)
+
+
+def _groups(
+    photos: Sequence[MappingPhoto], pairs: NDArray[np.int64]
+) -> list[tuple[int, list[int], _Partners]]:
+    """Return the rows of each first photo and of its partners, and these photos."""
+    groups = []
+    for first in np.unique(pairs[:, 0]).tolist():
+        seconds = pairs[pairs[:, 0] == first, 1].tolist()
+        partners = tuple(photos[second] for second in seconds)
+        groups.append((first, seconds, _Partners(photos[first], partners)))
+    return groups
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,6 +150,17 @@ class _MatchTask:
             partners=[self.features.key(partner) for partner in group.partners],
         )
 
+    def tally_key(self, group: _Partners) -> str:
+        camera = group.photo.camera
+        return key_of(
+            "fixed_things",
+            _REVISION["fixed_things"],
+            matches=self.matches_key(group),
+            max_error_px=self.verification.max_error_px,
+            camera=[*camera_values(camera), group.photo.camera_known],
+            of_camera=[self._are_of_one_camera(group.photo, partner) for partner in group.partners],
+        )
+
     def verified_key(self, group: _Partners) -> str:
         return key_of(
             "verified",
@@ -122,6 +169,14 @@ class _MatchTask:
             max_error_px=self.verification.max_error_px,
             min_matches=self.verification.min_matches,
             poses_known=self.verification.poses_known,
+            fixed=[
+                self.verification.fixed[sensor].tolist()
+                if (sensor := photo.record.sensor_id) in self.verification.fixed
+                else None
+                for photo in (group.photo, *group.partners)
+            ]
+            if self.verification.fixed
+            else None,
             views=[
                 [
                     *camera_values(photo.camera),
@@ -145,13 +200,47 @@ class _MatchTask:
         if not self.work.has(self.matches_key(group)):
             self.work.get(self.matches_key(group), compute)
 
+    def match_and_tally(self, group: _Partners) -> None:
+        self.match(group)
+        if not self.work.has(self.tally_key(group)):
+            self.work.get(self.tally_key(group), lambda: self._tallied(group))
+
+    def _tallied(self, group: _Partners) -> Item:
+        photo = group.photo
+        tally = Tally.of(photo.camera)
+        own = self.features.read(photo).keypoints
+        matches = _rows_by_partner(self.work.read(self.matches_key(group)))
+        asked = []
+        for partner, rows in zip(group.partners, matches, strict=True):
+            if not self._are_of_one_camera(photo, partner):
+                continue
+            pixels = own[rows[:, 0]], self.features.read(partner).keypoints[rows[:, 1]]
+            if some_keep_their_pixel(photo.camera, *pixels):
+                asked.append(pixels)
+        for pixels in asked[:: max(1, -(-len(asked) // _MOST_ASKED))]:
+            tally.add(
+                photo.camera,
+                *pixels,
+                self.verification.max_error_px,
+                calibrated=photo.camera_known,
+            )
+        return {"against": tally.against, "pairs": tally.pairs, "moved": tally.moved}
+
+    @staticmethod
+    def _are_of_one_camera(a: MappingPhoto, b: MappingPhoto) -> bool:
+        return a.record.sensor_id == b.record.sensor_id
+
     def verify(self, group: _Partners) -> None:
         def compute() -> Item:
             matches = _rows_by_partner(self.work.read(self.matches_key(group)))
             own = self.features.read(group.photo).keypoints
             found = []
-            for partner, rows in zip(group.partners, matches, strict=True):
+            for partner, matched in zip(group.partners, matches, strict=True):
                 theirs = self.features.read(partner).keypoints
+                rows = matched[
+                    ~self._are_fixed(group.photo, own[matched[:, 0]])
+                    & ~self._are_fixed(partner, theirs[matched[:, 1]])
+                ]
                 a, b = own[rows[:, 0]], theirs[rows[:, 1]]
                 good = self._verified(group.photo, partner, a, b)
                 kept = rows[good]
@@ -160,6 +249,12 @@ class _MatchTask:
 
         if not self.work.has(self.verified_key(group)):
             self.work.get(self.verified_key(group), compute)
+
+    def _are_fixed(self, photo: MappingPhoto, pixels: NDArray[np.float32]) -> NDArray[np.bool_]:
+        mask = self.verification.fixed.get(photo.record.sensor_id)
+        if mask is None:
+            return np.zeros(len(pixels), dtype=bool)
+        return are_masked(photo.camera, mask, pixels)
 
     def _verified(
         self,

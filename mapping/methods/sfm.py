@@ -18,6 +18,7 @@ from pydantic import JsonValue
 from mapping.frames.anchor import align_positions, known_positions
 from mapping.frames.anchor_error import place_error
 from mapping.methods.colmap_scene import Rigs
+from mapping.methods.fixed_things import Mask
 from mapping.methods.intrinsics import (
     CAMERAS,
     CameraOrigin,
@@ -25,7 +26,7 @@ from mapping.methods.intrinsics import (
     notes_on,
     origin_of,
 )
-from mapping.methods.matching import Matches, Verification, match_pairs
+from mapping.methods.matching import Matches, Verification, find_fixed, match_pairs
 from mapping.methods.model_stage import believed_pairs, make_model, with_latecomers
 from mapping.methods.pieces import MIN_PHOTOS, models_beside
 from mapping.methods.scenes import find_pairs, make_scene
@@ -80,6 +81,8 @@ def landmarks_from_matches(
         min_matches=config.min_num_matches,
         poses_known=not settings.estimate_poses,
     )
+    fixed = find_fixed(context, photos, pairs.rows, verification)
+    verification = replace(verification, fixed=fixed)
     matched = match_pairs(context, photos, pairs.rows, verification)
     rigs = known_rigs(dataset, {photo.record.sensor_id for photo in photos})
     model = make_model(context, photos, rigs, *matched, settings)
@@ -87,10 +90,10 @@ def landmarks_from_matches(
     if settings.estimate_poses:
         look = _Look(context, photos, rigs, pairs.rows, verification, settings)
         models = look.models(model, *matched)
-    absent = _notes_on_absent(photos, models)
+    notes = (*_notes_on_fixed(photos, fixed), *_notes_on_absent(photos, models))
     return tuple(
         replace(
-            _placed_landmarks(dataset, photos, one, settings, metric=metric, notes=absent),
+            _placed_landmarks(dataset, photos, one, settings, metric=metric, notes=notes),
             pairs=(scene, pairs),
         )
         for one in models
@@ -240,6 +243,19 @@ def _placed_landmarks(
         rig_scale=rig_scale,
         notes=notes,
     )
+
+
+def _notes_on_fixed(photos: Sequence[MappingPhoto], fixed: Mapping[str, Mask]) -> tuple[str, ...]:
+    """Return a note for each camera with something fixed to its picture."""
+    notes = []
+    for sensor, mask in fixed.items():
+        names = [photo.name for photo in photos if photo.record.sensor_id == sensor]
+        notes.append(
+            f"about {mask.mean():.0%} of the picture keeps its pixels while the rest moves (part "
+            "of a vehicle, a logo, dirt on the lens?); its matches were not used, in "
+            f"{len(names)} photos: {some(names)}"
+        )
+    return tuple(notes)
 
 
 def _notes_on_absent(

@@ -27,6 +27,7 @@ def fits_two_views(
     max_error_px: float,
     *,
     calibrated: bool,
+    among: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.bool_]:
     """Tell which matched pixels (n, 2) fit the relative pose of two photos.
 
@@ -38,6 +39,8 @@ def fits_two_views(
         calibrated: whether the intrinsics are known; else a fundamental matrix is estimated of the
             pixels, whatever their distortion.
         max_error_px: largest distance to the epipolar line.
+        among: (n,) matches that the relative pose is estimated from; all by default. The others may
+            fit it all the same.
     """
     fits = np.zeros(len(pixels_a), dtype=bool)
     if calibrated:
@@ -49,7 +52,8 @@ def fits_two_views(
         ]
     else:
         seen = [pixels_a.astype(np.float64), pixels_b.astype(np.float64)]
-    usable = np.flatnonzero(np.isfinite(np.concatenate(seen, axis=1)).all(axis=1))
+    finite = np.isfinite(np.concatenate(seen, axis=1)).all(axis=1)
+    usable = np.flatnonzero(finite if among is None else finite & among)
     if len(usable) < _FEWEST:
         return fits
     options = {
@@ -62,18 +66,37 @@ def fits_two_views(
     a, b = (points[usable] for points in seen)
     if calibrated:
         pinhole = {"model": "SIMPLE_PINHOLE", "width": 0, "height": 0, "params": [focal, 0.0, 0.0]}
-        _, told = poselib.estimate_relative_pose(a, b, pinhole, pinhole, options, {})
+        pose, told = poselib.estimate_relative_pose(a, b, pinhole, pinhole, options, {})
+        cross = np.cross(np.eye(3), pose.t)
+        to_rays = np.diag([1 / focal, 1 / focal, 1.0])
+        fundamental = to_rays @ cross.T @ pose.R @ to_rays
     else:
-        _, told = poselib.estimate_fundamental(a, b, options, {})
+        fundamental, told = poselib.estimate_fundamental(a, b, options, {})
     found = np.array(told["inliers"], dtype=bool)
     # Without a model, the mask is not all false.
     if told["num_inliers"] < _FEWEST or len(found) != len(usable):
         return fits
     share = max(_share_near_a_line(camera, max_error_px) for camera in cameras)
     chance = log10_chance(len(usable), int(found.sum()), share, calibrated=calibrated)
-    if chance <= MAX_LOG10_CHANCE:
-        fits[usable[found]] = True
+    if chance > MAX_LOG10_CHANCE:
+        return fits
+    fits[usable[found]] = True
+    if among is not None:
+        others = np.flatnonzero(finite & ~among)
+        errors = _sampson_errors(fundamental, *(points[others] for points in seen))
+        fits[others[errors <= max_error_px]] = True
     return fits
+
+
+def _sampson_errors(
+    fundamental: NDArray[np.float64], a: NDArray[np.float64], b: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return how far (n,) matched pixels (n, 2) are off their epipolar lines, to first order."""
+    ones = np.ones((len(a), 1))
+    first, second = np.hstack([a, ones]), np.hstack([b, ones])
+    lines, back = first @ fundamental.T, second @ fundamental
+    gradients = (lines[:, :2] ** 2).sum(axis=1) + (back[:, :2] ** 2).sum(axis=1)
+    return np.asarray(np.abs((second * lines).sum(axis=1)) / np.sqrt(np.maximum(gradients, 1e-300)))
 
 
 def log10_chance(num_matches: int, num_inliers: int, share: float, *, calibrated: bool) -> float:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,8 @@ import pytest
 from numpy.typing import NDArray
 
 from mapping.cluster.workers import Workers
-from mapping.methods.matching import Verification, fits_poses, match_pairs
+from mapping.methods.fixed_things import are_masked
+from mapping.methods.matching import Verification, find_fixed, fits_poses, match_pairs
 from mapping.stages.context import BuildContext
 from mapping.stages.landmarks import View
 from mapping.stages.networks import Networks
@@ -108,3 +110,49 @@ def test_the_limit_is_in_pixels_of_the_photos() -> None:
     shifted = np.array([[250.0, 203.0], [250.0, 205.0], [350.0, 200.0]], np.float32)
     fits = fits_poses(views, at, shifted, 4.0)
     assert fits[:2].tolist() == [True, False]
+
+
+class FeaturesOnALogo(TrueFeatures):
+    """The camera turns as well, and its pictures bear a logo with the first 30 keypoints."""
+
+    logo = np.random.default_rng(2).uniform([500, 400], [600, 460], (30, 2)).astype(np.float32)
+
+    def read(self, photo: MappingPhoto) -> LocalFeatures:
+        angle = 0.1 * photo.record.timestamp
+        turn = np.array(
+            [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+        )
+        seen = Pose(turn, np.zeros(3)) @ pose_of(photo.record.timestamp)
+        pixels = project(CAMERA, seen.apply(POINTS)).astype(np.float32)
+        pixels[:30] = self.logo
+        ones = np.ones(60, np.float32)
+        return LocalFeatures(pixels, np.eye(60, dtype=np.float32), ones, ones)
+
+
+def test_what_is_fixed_to_the_picture_has_no_verified_matches(tmp_path: Path) -> None:
+    networks = Networks(None, Inference.TORCH)
+    features = FeaturesOnALogo()
+    context = BuildContext(WorkFolder(tmp_path), features, networks, Workers(1), lambda *_: None)
+    photos = [make_photo(number) for number in range(4)]
+    pairs = np.array([[a, b] for a in range(4) for b in range(a + 1, 4)])
+    plain = Verification(4.0, 15, poses_known=False)
+    fixed = find_fixed(context, photos, pairs, plain)
+    assert fixed.keys() == {"cam"}
+    assert are_masked(CAMERA, fixed["cam"], features.logo).mean() > 0.8
+    found, key = match_pairs(context, photos, pairs, replace(plain, fixed=fixed))
+    assert len(found) == 6
+    assert all((pair.rows >= 30).mean() > 0.8 and len(pair.rows) >= 28 for pair in found)
+    assert key != match_pairs(context, photos, pairs, plain)[1]
+
+
+def test_photos_of_one_camera_each_have_nothing_fixed(tmp_path: Path) -> None:
+    networks = Networks(None, Inference.TORCH)
+    context = BuildContext(
+        WorkFolder(tmp_path), FeaturesOnALogo(), networks, Workers(1), lambda *_: None
+    )
+    photos = [
+        replace(photo, record=replace(photo.record, sensor_id=photo.name))
+        for photo in map(make_photo, range(4))
+    ]
+    pairs = np.array([[a, b] for a in range(4) for b in range(a + 1, 4)])
+    assert find_fixed(context, photos, pairs, Verification(4.0, 15, poses_known=False)) == {}

@@ -46,6 +46,23 @@ def test_too_few_matches_do_not_fit(count: int, calibrated: bool) -> None:
     assert fits.tolist() == [False] * count
 
 
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_matches_that_the_pose_is_not_estimated_from_may_fit_it(calibrated: bool) -> None:
+    a, b = two_photos(120, 120)
+    among = np.arange(240) < 90
+    fits = fits_two_views((CAMERA, CAMERA), a, b, 4.0, calibrated=calibrated, among=among)
+    assert fits[:120].mean() > 0.97
+    assert fits[120:].mean() < 0.15
+
+
+def test_infinitely_far_points_fit_a_motion_without_a_turn_though_few_tell_it() -> None:
+    a, b = two_photos(90, 0)
+    far = np.random.default_rng(1).uniform([0, 0], [640, 480], (300, 2)).astype(np.float32)
+    a, b, among = np.concatenate([a, far]), np.concatenate([b, far]), np.arange(390) < 90
+    fits = fits_two_views((CAMERA, CAMERA), a, b, 1.0, calibrated=True, among=among)
+    assert fits.mean() > 0.97
+
+
 def test_pixels_without_a_ray_do_not_fit() -> None:
     camera = Camera("OPENCV", 640, 480, (500.0, 500.0, 320.0, 240.0, -0.9, 0.0, 0.0, 0.0))
     at = np.zeros((50, 2), np.float32)
