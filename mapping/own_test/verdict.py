@@ -85,7 +85,7 @@ def _without_place(opened: Map, left_out: Sequence[str]) -> Doubt | None:
     total = len(opened.images) + len(left_out)
     if len(left_out) <= MOST_LEFT_OUT * total:
         return None
-    message = f"{len(left_out)} of {total} photos found no place beside the others"
+    message = f"{len(left_out)} of {total} photos found no place beside those of this map"
     return Doubt(kind="left_out", message=message, photos=tuple(left_out[:MAX_NAMES]))
 
 

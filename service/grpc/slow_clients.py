@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable
-from contextlib import asynccontextmanager
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from functools import partial
 from typing import Any, NamedTuple
 
 import grpc
@@ -23,6 +24,9 @@ from visloc_api.words.message import MAX_INSTANT_VALUES
 # Calls whose only message may be large.
 _LARGE_MESSAGES = ("Localize", "LocalizeRig")
 
+Place = Callable[[], AbstractAsyncContextManager[object]]
+"""Makes what one message is waited for in; it raises TimeoutError."""
+
 
 class TimelyCalls(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
     """Ends calls whose messages do not come or cannot be parsed.
@@ -34,7 +38,7 @@ class TimelyCalls(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
         max_message_bytes: of one message. gRPC does not tell how much of a message has arrived,
             so every large one gets the time of the largest: ``grace_s`` plus a second for every
             100 kB.
-        max_waiting: calls that wait for a message at once.
+        max_waiting: calls that wait for a large message at once.
     """
 
     def __init__(
@@ -62,12 +66,18 @@ class TimelyCalls(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
             return handler  # type: ignore[return-value]  # gRPC answers: no such method
         behaviour = behaviour_of(handler)
         name = handler_call_details.method.rpartition("/")[2]
-        patience_s = self._patience_s if name in _LARGE_MESSAGES else self._silence_s
+        place: Place
+        if name in _LARGE_MESSAGES:
+            patience_s = self._patience_s
+            place = partial(self._waiting.place, patience_s)
+        else:  # soon over by itself
+            patience_s = self._silence_s
+            place = partial(asyncio.timeout, patience_s)
 
         async def serve(messages: AsyncIterator[Any], context: Context) -> Any:
             with self._connections.in_use(context.peer()):
                 try:
-                    return await behaviour(_timely(messages, patience_s, self._waiting), context)
+                    return await behaviour(_timely(messages, patience_s, place), context)
                 except (TimedOut, InvalidInput) as error:  # before the method's own envelope
                     await self._envelope.refuse(name, error, context)
 
@@ -75,7 +85,7 @@ class TimelyCalls(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
 
 
 class Waiting:
-    """The calls that wait for a message, at most ``most``: for more, the longest is given up.
+    """The calls that wait for a large message, at most ``most``: for more, the longest is given up.
 
     A message may take minutes, if it is as large as any may be. Without this, calls whose messages
     never come would take all places.
@@ -142,11 +152,11 @@ def _malformed(got: str) -> VislocError:
 
 
 async def _timely(
-    messages: AsyncIterator[Any], patience_s: float, waiting: Waiting
+    messages: AsyncIterator[Any], patience_s: float, place: Place
 ) -> AsyncGenerator[Any]:
     while True:
         try:
-            async with waiting.place(patience_s):
+            async with place():
                 message = await anext(messages, None)
         except TimeoutError:
             raise too_slow(patience_s, "no message in that time") from None
