@@ -110,7 +110,10 @@ def match_pairs(
     groups = [(first, seconds) for first, seconds, _ in found_groups]
     partners = [group for _, _, group in found_groups]
     task = _MatchTask(context.work, context.features, verification)
-    context.run("matches", task.match, partners)
+    # Usually, what is fixed was looked for among the same matches.
+    missing = [group for group in partners if not context.work.has(task.matches_key(group))]
+    if missing:
+        context.run("matches", task.match, missing)
     context.run("verified", task.verify, partners)
     keys = [task.verified_key(group) for group in partners]
     found = [
