@@ -24,11 +24,13 @@ from benchmarks.change.table import write_tables
 from benchmarks.trust.asking import Maps
 from benchmarks.trust.maps import SAMPLE, Places, make_missing
 from benchmarks.trust.outcomes import Query
+from benchmarks.trust.queries import resized_to
 from benchmarks.trust.scenarios import RIGHT, RIGHT_AT_NIGHT, night, photos_of
 
 # Every so-manieth query of each map is changed.
 EVERY = {"redkitchen": 8, "castle": 3, "kitti_curve": 16, "gardenspoint": 30}
 EVERY_ROOM = 2
+WIDEST_PX = 1024
 UNCHANGED = "unchanged"
 DAY, NIGHT, BY_NUMBER = "day", "night", "night by number"
 NAMES = (DAY, NIGHT, BY_NUMBER, UNCHANGED, *KINDS, ROOM)
@@ -99,7 +101,20 @@ def _queries(places: Places, name: str) -> Iterator[tuple[str, Query]]:
 
 def _some(places: Places) -> Iterator[Query]:
     for map_id, every in EVERY.items():
-        yield from list(photos_of(places, map_id, map_id, "query", RIGHT))[::every]
+        for query in list(photos_of(places, map_id, map_id, "query", RIGHT))[::every]:
+            yield _at_most_as_wide(query)
+
+
+def _at_most_as_wide(query: Query) -> Query:
+    """Reduce a wide photo: changes take time by the pixel, and features see no more of them."""
+    (only,) = query.photos
+    assert only.camera is not None
+    width = min(only.photo.width, WIDEST_PX)
+    height = round(only.photo.height * width / only.photo.width)
+    small = resized_to(only.photo.rgb, width, height)
+    camera = only.camera.scaled(width, height)
+    photo = replace(only.photo, rgb=small.rgb)
+    return replace(query, photos=(replace(only, photo=photo, camera=camera),))
 
 
 def _room(places: Places) -> Iterator[Query]:

@@ -31,8 +31,9 @@ from visloc.types import Reason, Refusal
 # Refusals of photos that have too few matches for their pose.
 _TOO_FEW = (Reason.NO_POSE, Reason.TOO_FEW_INLIERS, Reason.LOW_INLIER_RATIO)
 # A pose counts as right when its landmarks are found this many standard deviations more often than
-# by chance. Photos of other places reach 3.1, of floors that look alike 5.4.
-SURE = 6.0
+# by chance. Of mapping photos that maps without them were asked about, wrong poses reach 7.8: those
+# of prints (``python -m benchmarks.probability scores``).
+SURE = 8.5
 # Poses with less are not refined: those that turned out right had more.
 _PROMISING = 2.0
 _MAX_EXPECTED = 3000
@@ -96,6 +97,20 @@ def expected_pose(
         A pose refined on the landmarks that it predicts; its inliers and covariance are those of
         the problem's matches.
     """
+    (view,), max_error_px = problem.views, problem.registration.max_error_px
+    for pose, support in tried_poses(problem, proposed, best):
+        if support >= SURE:
+            return refine_generalized_pose([view], pose, max_error_px=max_error_px)
+    return None
+
+
+def tried_poses(
+    problem: Problem, proposed: Proposed, best: GeneralizedPose | None
+) -> Iterator[tuple[Pose, float]]:
+    """Yield doubtful poses, and how many more landmarks than by chance are where they predict them.
+
+    In standard deviations, as ``Guided.support``; the arguments are those of ``expected_pose``.
+    """
     (view,), geometry = problem.views, problem.constraints.geometry
     max_error_px = problem.registration.max_error_px
     tree = KDTree(proposed.shown.keypoints.astype(np.float64), balanced_tree=False)
@@ -112,9 +127,7 @@ def expected_pose(
             )
             if again is not None and again.support > found.support:
                 found, pose = again, refined.rig_from_world
-        if found.support >= SURE:
-            return refine_generalized_pose([view], pose, max_error_px=max_error_px)
-    return None
+        yield pose, found.support
 
 
 def guided_matches(
