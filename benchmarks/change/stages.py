@@ -18,9 +18,6 @@ from visloc.localization.constraints import Constraints
 from visloc.localization.feature_cache import FeatureCache
 from visloc.localization.gates import (
     Problem,
-    enough_inliers,
-    enough_of_the_matches,
-    first_refusal,
 )
 from visloc.localization.localizer import Localizer
 from visloc.localization.solving import Look
@@ -64,7 +61,6 @@ class Staged:
         error_deg: as above, degrees.
         probability: of the answer.
         seconds: until the answer.
-        guided: whether an answer would be a refusal but for what its pose predicts (decision 0039).
     """
 
     condition: str
@@ -82,7 +78,6 @@ class Staged:
     error_deg: float | None
     probability: float | None
     seconds: float
-    guided: bool
 
 
 class Staging:
@@ -151,7 +146,6 @@ class Staging:
             None if error is None else error[1],
             answer.probability if isinstance(answer, Localized) else None,
             sum(answer.evidence.seconds.values()) if accepted else 0.0,
-            accepted and answer.evidence.turned == 0 and not _is_supported(problem, found),
         )
 
     def _of_nearby_numbers(self, number: int | None) -> NDArray[np.bool_]:
@@ -245,12 +239,6 @@ class Staging:
         }
         fused = retrieve(query, index, num, fusion=opened.fusion).images
         return {name: _first(showing[rows]) for name, rows in {**ranked, "fused": fused}.items()}
-
-
-def _is_supported(problem: Problem, found: GeneralizedPose | None) -> bool:
-    """Tell whether a pose has so many inliers that no prediction is needed."""
-    gates = (enough_inliers, enough_of_the_matches)
-    return found is not None and first_refusal(gates, problem, found) is None
 
 
 def _first(shown: NDArray[np.bool_]) -> int:

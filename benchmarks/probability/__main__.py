@@ -13,27 +13,20 @@ each is judged by a model of all others.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from dataclasses import asdict
-from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import typer
 
-from benchmarks.probability.expectations import DARK, of_strangers, table_of_scores, tried
 from benchmarks.probability.learning import Lessons, judged_by_others, learn, table_of
-from benchmarks.probability.teachers import Question, Teacher, evidence_for
+from benchmarks.probability.teachers import Taught, Teacher
 from visloc.archive import MapStore
 from visloc.features import make_local_features
-from visloc.localization.localizer import Localizer
 from visloc.localization.probability import MODEL_FILE
 
 app = typer.Typer(add_completion=False, no_args_is_help=True)
 _KEPT = Path(".training/poses")
-_SCORES = Path(".training/expectations")
-_NUM_DARK, _NUM_STRANGERS = 8, 5
 _NUM_PHOTOS, _NUM_FAR, _NUM_ELSEWHERE, _NUM_PAINTED = 30, 10, 12, 8
 
 
@@ -50,13 +43,12 @@ def teach(
     opened = MapStore(maps_dir).open(map_ref)
     extractor = make_local_features(opened.manifest.local_features.fingerprint.name)
     teacher = Teacher(opened, photos, extractor, sorted(foreign.glob("*/*.jpg")))
-    questions: list[Iterator[Question]] = [
-        teacher.held_out(_NUM_PHOTOS),
-        teacher.from_afar(_NUM_FAR),
-        teacher.from_elsewhere(_NUM_ELSEWHERE) if room is None else iter(()),
-        iter(()) if room is None else teacher.painted(room, _NUM_PAINTED),
+    taught: list[Taught] = [
+        *teacher.held_out(_NUM_PHOTOS),
+        *teacher.from_afar(_NUM_FAR),
+        *(teacher.from_elsewhere(_NUM_ELSEWHERE) if room is None else ()),
+        *(() if room is None else teacher.painted(room, _NUM_PAINTED)),
     ]
-    taught = [each for each in map(evidence_for, chain(*questions)) if each is not None]
     kept.mkdir(parents=True, exist_ok=True)
     np.savez(
         kept / f"{opened.manifest.id}.npz",
@@ -67,46 +59,6 @@ def teach(
     )
     right = sum(each.right for each in taught)
     typer.echo(f"{opened.manifest.id}: {right} right and {len(taught) - right} wrong poses")
-
-
-@app.command()
-def expect(
-    maps_dir: Path,
-    map_ref: str,
-    foreign: Annotated[Path, typer.Option(help="folder of folders of JPEGs")],
-    photos: Annotated[Path | None, typer.Option(help="folder of the map's photos")] = None,
-    other: Annotated[list[str] | None, typer.Option(help="MAP=PHOTOS of another place")] = None,
-    room: Annotated[int | None, typer.Option(help="seed of the sample room")] = None,
-    kept: Path = _SCORES,
-) -> None:
-    """Try doubtful poses of one map, and keep their scores; its own photos only with --photos."""
-    store = MapStore(maps_dir)
-    opened = store.open(map_ref)
-    extractor = make_local_features(opened.manifest.local_features.fingerprint.name)
-    questions: list[Iterator[Question]] = []
-    if photos is not None:
-        teacher = Teacher(opened, photos, extractor, sorted(foreign.glob("*/*.jpg")))
-        questions = [
-            teacher.held_out(_NUM_DARK, DARK),
-            teacher.from_elsewhere(_NUM_ELSEWHERE) if room is None else iter(()),
-            iter(()) if room is None else teacher.painted(room, _NUM_PAINTED),
-        ]
-    pairs = [each.partition("=")[::2] for each in other or []]
-    others = [(store.open(map_id), Path(folder)) for map_id, folder in pairs]
-    localizer, random = Localizer(opened, extractor), np.random.default_rng(0)
-    questions.append(of_strangers(localizer, others, _NUM_STRANGERS, random))
-    kept.mkdir(parents=True, exist_ok=True)
-    with (kept / f"{opened.manifest.id}.jsonl").open("w", buffering=1, encoding="utf-8") as lines:
-        for found in map(tried, chain(*questions)):
-            if found is not None:
-                lines.write(json.dumps(asdict(found)) + "\n")
-
-
-@app.command()
-def scores(kept: Path = _SCORES) -> None:
-    """Print how often right and wrong poses reach a score."""
-    for line in table_of_scores(kept):
-        typer.echo(line)
 
 
 @app.command()

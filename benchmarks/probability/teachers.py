@@ -7,14 +7,14 @@ each other. Queries of benchmarks teach nothing.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.probability.disguises import DISGUISES, Disguise, Image, printed, resembling
+from benchmarks.probability.disguises import DISGUISES, Image, printed, resembling
 from benchmarks.probability.held_out_maps import without
 from mapping.report.look_alikes import shares_place
 from samples.render import render_photo
@@ -65,25 +65,6 @@ class Taught:
     features: NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Question:
-    """A photo that a map is asked about.
-
-    Attributes:
-        localizer: of the map, or of a part of it.
-        kind: what was done to the photo, or to the map.
-        rgb: its pixels.
-        camera: that took it.
-        truth: relative to the map's origin; None when no pose is right.
-    """
-
-    localizer: Localizer
-    kind: str
-    rgb: Image
-    camera: Camera
-    truth: Pose | None
-
-
 class Teacher:
     """Asks a map about photos whose poses are known.
 
@@ -109,9 +90,7 @@ class Teacher:
         stamps = np.array([image.timestamp for image in full.images])
         _, self._instants = np.unique(stamps, return_inverse=True)
 
-    def held_out(
-        self, num_photos: int, disguises: Mapping[str, Disguise] = DISGUISES
-    ) -> Iterator[Question]:
+    def held_out(self, num_photos: int) -> Iterator[Taught]:
         """Ask about photos that are not in the map: as they are, harder, mirrored, printed."""
         parts = list(self._parts())
         for part in parts:
@@ -119,19 +98,19 @@ class Teacher:
             count = max(1, round(num_photos * len(part) / sum(map(len, parts))))
             for image in _evenly(part, count):
                 rgb, camera, truth = self._taken(image)
-                yield Question(localizer, "plain", rgb, camera, truth)
-                kinds = self._random.choice(list(disguises), _DISGUISES_PER_PHOTO, replace=False)
+                yield from self._ask(localizer, "plain", rgb, camera, truth)
+                kinds = self._random.choice(list(DISGUISES), _DISGUISES_PER_PHOTO, replace=False)
                 for kind in map(str, kinds):
-                    harder = disguises[kind](rgb, camera, self._scene(), self._random)
-                    yield Question(localizer, kind, *harder, truth)
+                    harder = DISGUISES[kind](rgb, camera, self._scene(), self._random)
+                    yield from self._ask(localizer, kind, *harder, truth)
                 alike = resembling(rgb, self._scene(), self._random)
-                yield Question(localizer, "resembling", alike, camera, None)
-                yield Question(localizer, "mirrored", rgb[:, ::-1], camera, None)
+                yield from self._ask(localizer, "resembling", alike, camera, None)
+                yield from self._ask(localizer, "mirrored", rgb[:, ::-1], camera, None)
                 for _ in range(_PRINTS_PER_PHOTO):
                     disguised = printed(rgb, self._scene(), self._random)
-                    yield Question(localizer, "print", *disguised, None)
+                    yield from self._ask(localizer, "print", *disguised, None)
 
-    def from_afar(self, num_photos: int) -> Iterator[Question]:
+    def from_afar(self, num_photos: int) -> Iterator[Taught]:
         """Ask about photos when nobody photographed anything near to them."""
         for image in _evenly(np.arange(len(self._full.images)), num_photos):
             apart = self._viewpoints.apart_from(self._viewpoints.pose(image))
@@ -140,13 +119,13 @@ class Teacher:
                 left_out = np.flatnonzero((apart < within) | same)
                 yield from self._ask_without(image, left_out, f"from afar {within}")
 
-    def from_elsewhere(self, num_photos: int) -> Iterator[Question]:
+    def from_elsewhere(self, num_photos: int) -> Iterator[Taught]:
         """Ask about photos of a part of the place of which the map has nothing."""
         for image in _evenly(np.arange(len(self._full.images)), num_photos):
             left_out = np.flatnonzero(shares_place(self._full, self._viewpoints, image))
             yield from self._ask_without(image, left_out, "elsewhere")
 
-    def painted(self, seed: int, num_photos: int) -> Iterator[Question]:
+    def painted(self, seed: int, num_photos: int) -> Iterator[Taught]:
         """Ask a map of the sample room about the same room, changed, and about other rooms."""
         localizer, rig = self._localizer(np.empty(0, np.int64)), stereo_rig(640, 480)
         origin = np.array(self._full.manifest.world.origin)
@@ -165,9 +144,9 @@ class Teacher:
                 differs = np.abs(photo.astype(np.int16) - old).max(axis=2) > _CHANGED_GREY_LEVELS
                 truth = Pose(pose.rotation, pose.translation + pose.rotation @ origin)
                 if differs.mean() >= _OTHER_ROOM:
-                    yield Question(localizer, "other room", photo, camera, None)
+                    yield from self._ask(localizer, "other room", photo, camera, None)
                 elif differs.mean() <= _SAME_ROOM:
-                    yield Question(localizer, "changed room", photo, camera, truth)
+                    yield from self._ask(localizer, "changed room", photo, camera, truth)
 
     def _parts(self) -> Iterator[NDArray[np.int64]]:
         for third in range(_THIRDS):
@@ -178,11 +157,9 @@ class Teacher:
     def _localizer(self, left_out: NDArray[np.int64]) -> Localizer:
         return Localizer(without(self._full, left_out), self._extractor)
 
-    def _ask_without(
-        self, image: int, left_out: NDArray[np.int64], kind: str
-    ) -> Iterator[Question]:
+    def _ask_without(self, image: int, left_out: NDArray[np.int64], kind: str) -> Iterator[Taught]:
         if len(self._full.images) - len(left_out) >= 4:
-            yield Question(self._localizer(left_out), kind, *self._taken(image))
+            yield from self._ask(self._localizer(left_out), kind, *self._taken(image))
 
     def _taken(self, image: int) -> tuple[Image, Camera, Pose]:
         record = self._full.images[image]
@@ -192,42 +169,40 @@ class Teacher:
     def _scene(self) -> Image:
         return read_photo_file(self._foreign[int(self._random.integers(len(self._foreign)))]).rgb
 
+    def _ask(
+        self, localizer: Localizer, kind: str, rgb: Image, camera: Camera, truth: Pose | None
+    ) -> Iterator[Taught]:
+        """Find the best pose; without truth every pose is wrong."""
+        options = LocalizeOptions()
+        look = localizer.look(Photo(np.ascontiguousarray(rgb)), camera, options)
+        if look.shown is None or len(look.matches.pixels) < _LEAST_MATCHES:
+            return
+        matches = look.matches
+        view = MatchedView(look.evidence.camera, Pose.identity(), matches.pixels, matches.points)
+        constraints = Constraints(localizer.geometry, NO_PRIORS)
+        problem = Problem((view,), (look.evidence.camera_source,), options, constraints)
+        pose = problem.solve()
+        if pose is None or pose.covariance is None or pose.num_inliers < _LEAST_INLIERS:
+            return
+        right = self._is_right(pose.rig_from_world, truth)
+        if right is not None:
+            features = evidence_of(
+                localizer.geometry,
+                [SeenView(view, look.shown, pose.inliers[0])],
+                pose.rig_from_world,
+                pose.covariance,
+                problem.registration.max_error_px,
+            )
+            refusal = first_refusal((*GATES, *CONFIRMATIONS), problem, pose)
+            yield Taught(kind, right, refusal is None, features)
 
-def evidence_for(question: Question) -> Taught | None:
-    """Find the best pose, and what speaks for and against it; None where there is no lesson."""
-    localizer, camera, options = question.localizer, question.camera, LocalizeOptions()
-    look = localizer.look(Photo(np.ascontiguousarray(question.rgb)), camera, options)
-    if look.shown is None or len(look.matches.pixels) < _LEAST_MATCHES:
-        return None
-    matches = look.matches
-    view = MatchedView(look.evidence.camera, Pose.identity(), matches.pixels, matches.points)
-    constraints = Constraints(localizer.geometry, NO_PRIORS)
-    problem = Problem((view,), (look.evidence.camera_source,), options, constraints)
-    pose = problem.solve()
-    if pose is None or pose.covariance is None or pose.num_inliers < _LEAST_INLIERS:
-        return None
-    right = is_right(question, pose.rig_from_world)
-    if right is None:
-        return None
-    features = evidence_of(
-        localizer.geometry,
-        [SeenView(view, look.shown, pose.inliers[0])],
-        pose.rig_from_world,
-        pose.covariance,
-        problem.registration.max_error_px,
-    )
-    refusal = first_refusal((*GATES, *CONFIRMATIONS), problem, pose)
-    return Taught(question.kind, right, refusal is None, features)
-
-
-def is_right(question: Question, pose: Pose) -> bool | None:
-    """Whether a pose is right; None when it is neither right nor clearly wrong."""
-    if question.truth is None:
-        return False
-    away, turned = pose_error(pose, question.truth)
-    reach = question.localizer.geometry.reach
-    off = max(away / (_RIGHT_OF_REACH * reach), turned / _RIGHT_DEG)
-    return True if off <= 1.0 else None if off <= 2.0 else False
+    def _is_right(self, pose: Pose, truth: Pose | None) -> bool | None:
+        """Whether a pose is right; None when it is neither right nor clearly wrong."""
+        if truth is None:
+            return False
+        away, turned = pose_error(pose, truth)
+        off = max(away / (_RIGHT_OF_REACH * self._viewpoints.reach), turned / _RIGHT_DEG)
+        return True if off <= 1.0 else None if off <= 2.0 else False
 
 
 def _evenly(rows: NDArray[np.int64], count: int) -> list[int]:

@@ -47,7 +47,7 @@ def test_strengths_rise(kind: str) -> None:
 
 def staged(lost: str, ranks: dict[str, int], reason: str | None = None) -> Staged:
     return Staged(
-        "night", "m", "p", lost, reason, ranks, 3, 100, 40, 40, 0, 0.1, 1.0, 0.5, 0.1, False
+        "night", "m", "p", lost, reason, ranks, 3, 100, 40, 40, 0, 0.1, 1.0, 0.5, 0.1
     )  # fmt: skip
 
 

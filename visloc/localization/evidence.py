@@ -81,17 +81,15 @@ class SeenView:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Expected:
+class _Expected:
     """Landmarks that a camera at a pose sees.
 
     Attributes:
         pixels: (e, 2) float64.
-        points: (e, 3) float64, relative to the map's origin.
         descriptors: (e, D) int8, of the observation from the most similar viewpoint.
     """
 
     pixels: NDArray[np.float64]
-    points: NDArray[np.float64]
     descriptors: NDArray[np.int8]
 
 
@@ -252,8 +250,7 @@ def _compare(
 ) -> _Compared:
     """Look for the landmarks that a camera at the pose sees."""
     camera, shown = seen.view.camera, seen.shown
-    cam_from_world = seen.view.cam_from_rig @ rig_from_world
-    apart, expected = expected_landmarks(geometry, camera, cam_from_world, _MAX_EXPECTED)
+    apart, expected = _expected(geometry, camera, seen.view.cam_from_rig @ rig_from_world)
     keypoints = shown.keypoints.astype(np.float64)
     num, grid = len(expected.pixels), _Grid.of(camera)
     comparable, explained = np.zeros(num, dtype=np.bool_), np.zeros(num, dtype=np.bool_)
@@ -271,9 +268,9 @@ def _compare(
         theirs = shown.descriptors.rows[near].astype(np.float32)
         ours = expected.descriptors[comparable].astype(np.float32)
         if len(ours):
-            similarity = best_products(theirs, ours, there)
+            similarity = _best(theirs, ours, there)
             # As similar would be any other landmark in its place.
-            chance = best_products(theirs, np.roll(ours, len(ours) // 2, axis=0), there)
+            chance = _best(theirs, np.roll(ours, len(ours) // 2, axis=0), there)
             deviation = max(
                 float(chance.std()), _LEAST_DEVIATION * float(np.abs(chance).max()), 1.0
             )
@@ -316,7 +313,7 @@ class _Grid:
         return np.asarray(np.clip(down, 0, rows) * self.columns + np.clip(across, 0, columns))
 
 
-def best_products(
+def _best(
     theirs: NDArray[np.float32], ours: NDArray[np.float32], there: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
     """Return the largest product of each landmark (n, D) with keypoints (n, k, D) near it.
@@ -328,10 +325,10 @@ def best_products(
     return np.asarray(np.where(there, products, -np.inf).max(axis=1), dtype=np.float64)
 
 
-def expected_landmarks(
-    geometry: MapGeometry, camera: Camera, cam_from_world: Pose, most: int
-) -> tuple[float, Expected]:
-    """Return how far the nearest mapping photo is, and ``most`` landmarks that a camera sees.
+def _expected(
+    geometry: MapGeometry, camera: Camera, cam_from_world: Pose
+) -> tuple[float, _Expected]:
+    """Return how far the nearest mapping photo is, and the landmarks that a camera sees.
 
     A landmark counts if a photo near the pose sees it from about the same side and distance.
     """
@@ -354,9 +351,9 @@ def expected_landmarks(
     kept = np.flatnonzero(np.isfinite(unlike))
     order = kept[np.argsort(unlike[kept], kind="stable")]
     _, first = np.unique(landmarks[order], return_index=True)  # of each, the most alike
-    rows = order[first][:: max(1, -(-len(first) // most))]
+    rows = order[first][:: max(1, -(-len(first) // _MAX_EXPECTED))]
     descriptors = np.asarray(opened.observation_descriptors)[observations[rows]]
-    return float(apart[nearest[0]]), Expected(pixels[rows], points[rows], descriptors)
+    return float(apart[nearest[0]]), _Expected(pixels[rows], descriptors)
 
 
 def _unlike(

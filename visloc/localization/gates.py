@@ -104,26 +104,14 @@ def registration_for(options: LocalizeOptions, cameras: Sequence[Camera]) -> Reg
     return replace(registration, max_error_px=registration.max_error_px * share)
 
 
-def accepted(
-    problem: Problem, best: GeneralizedPose, *, expected: bool = False
-) -> tuple[GeneralizedPose, Refusal | None]:
+def accepted(problem: Problem, best: GeneralizedPose) -> tuple[GeneralizedPose, Refusal | None]:
     """Judge the best pose of a problem.
 
     If the images fit two places, a pose prior decides: the returned pose may not be ``best``.
 
-    Args:
-        problem: that was solved.
-        best: its best pose.
-        expected: whether what the map has at the pose was surely found in the photo
-            (``visloc.localization.guided``), which the share of inliers and two halves of the
-            matches would show otherwise.
-
     Returns:
         The judged pose, and the reason to refuse it or None.
     """
-    if expected:
-        refusal = first_refusal(GATES_OF_EXPECTED, problem, best)
-        return (best, refusal) if refusal is not None else likely(problem, best)
     refusal = first_refusal(GATES, problem, best)
     if refusal is not None and refusal.reason is Reason.CONTRADICTS_PRIOR:
         other = _near_pose_prior(problem, best)
@@ -298,10 +286,6 @@ def likely(problem: Problem, pose: GeneralizedPose) -> tuple[GeneralizedPose, Re
 
 GATES: tuple[Gate, ...] = (enough_inliers, enough_of_the_matches, determined, within_the_priors)
 CONFIRMATIONS: tuple[Gate, ...] = (not_better_without_gravity, cameras_agree, halves_agree)
-GATES_OF_EXPECTED: tuple[Gate, ...] = (
-    *(enough_inliers, determined, within_the_priors),
-    *(not_better_without_gravity, cameras_agree),
-)
 
 
 def not_better_elsewhere(elsewhere: Problem, pose: GeneralizedPose | None) -> Refusal | None:

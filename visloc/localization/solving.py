@@ -14,7 +14,6 @@ from visloc.localization.camera_check import only_focal_length_contradicts
 from visloc.localization.constraints import Constraints, MapGeometry
 from visloc.localization.evidence import Shown
 from visloc.localization.gates import Problem, accepted, not_better_elsewhere
-from visloc.localization.guided import expected_pose, is_worth_guiding
 from visloc.localization.judge import not_probable_enough
 from visloc.localization.rivals import Proposed, stronger_place
 from visloc.localization.turning import REASONS_OF_TURNED_PHOTOS
@@ -360,14 +359,6 @@ def _find_pose(
         as_guess = _without_exif(problem, best)
         if as_guess is not None:
             return as_guess, *_judged(as_guess)
-    if refusal is not None and is_worth_guiding(problem, refusal):
-        looks = [image.look for image in images if image.look is not None]
-        pose = (
-            None if looks[0].proposed is None else expected_pose(problem, looks[0].proposed, best)
-        )
-        if pose is not None:
-            guided = accepted(problem, pose, expected=True)
-            return (problem, *guided) if guided[1] is None else (problem, best, refusal)
     return problem, best, refusal
 
 
