@@ -222,7 +222,7 @@ def prior(kind: str, share: float, photo: int, num: int, seed: int) -> NDArray[n
 def _timed(
     ask: Callable[[int], NDArray[np.int64]], count: int, passes: int
 ) -> tuple[list[NDArray[np.int64]], NDArray[np.float64]]:
-    """What was found, and the least seconds of some passes over all queries for each."""
+    """The photos found for each query, and the seconds that it took in its fastest pass."""
     seconds = np.empty((passes, count))
     for one in seconds:
         found = []

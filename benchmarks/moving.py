@@ -106,7 +106,7 @@ def built(folder: Path, poses: list[Pose], given: str) -> Map | None:
 
 
 def told(opened: Map, true: list[Pose]) -> str:
-    """What a map says of itself, beside how far off its poses are."""
+    """Say how far off the poses of a map are, and what the map tells of itself."""
     viewpoints = MapGeometry(opened).viewpoints
     found = [viewpoints.pose(row) for row in range(len(opened.images))]
     true = [true[int(Path(image.name).stem)] for image in opened.images]

@@ -1,4 +1,4 @@
-"""Where a photo is lost: retrieval, matching, the search for the pose, or a gate."""
+"""Tells at which stage a map loses a photo whose pose is known."""
 
 from __future__ import annotations
 
@@ -16,9 +16,7 @@ from visloc.features.local.readymade import is_ready_made
 from visloc.geometry import Pose
 from visloc.localization.constraints import Constraints
 from visloc.localization.feature_cache import FeatureCache
-from visloc.localization.gates import (
-    Problem,
-)
+from visloc.localization.gates import Problem
 from visloc.localization.localizer import Localizer
 from visloc.localization.solving import Look
 from visloc.options import LocalizeOptions
@@ -42,14 +40,14 @@ STAGES = ("right", "retrieval", "matching", "pose", "gate", "wrong")
 
 @dataclass(frozen=True, slots=True)
 class Staged:
-    """What became of one query.
+    """What a map did with one query.
 
     Attributes:
         condition: what was done to the photo.
         map_id: the map that was asked.
         photo: its name.
         lost: ``right``; or the stage that lost it; or ``wrong`` for an answer that is not right.
-        reason: of the refusal.
+        reason: the reason of the refusal; None for an answer.
         ranks: by global descriptor, and fused: the rank of the first photo that shows the place,
             from 1; 0 when none does.
         retrieved: of the photos that were searched, how many show the place.
@@ -59,7 +57,7 @@ class Staged:
         turned: degrees by which the photo was turned before it was answered.
         error: distance to the truth, units of the map; None without a pose.
         error_deg: as above, degrees.
-        probability: of the answer.
+        probability: what the answer stated; None for a refusal.
         seconds: until the answer.
     """
 

@@ -13,6 +13,7 @@ from contextlib import AsyncExitStack, ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import monotonic
+from typing import Any
 
 import httpx
 
@@ -190,12 +191,12 @@ async def _change(
         await use("room", last)
 
 
-async def _until_done(doors: Sequence[Doors], method: str, path: str, **body: object) -> str:
+async def _until_done(doors: Sequence[Doors], method: str, path: str, **body: Any) -> str:
     tries = 0
     while True:
         with suppress(httpx.TransportError):
             each = doors[tries % len(doors)]
-            response = await each.http.request(method, path, **body)  # type: ignore[arg-type]
+            response = await each.http.request(method, path, **body)
             if response.status_code not in (429, 503):
                 return str(response.status_code)
         tries += 1

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cached_property
 from typing import Any
 
 from fastapi import FastAPI, Request, Response
@@ -75,11 +75,11 @@ class App(FastAPI):
         """Add the route of the schema, which is complete when it is first asked for."""
 
         async def answer(_: Request) -> Response:
-            return Response(self._written(), media_type="application/json")
+            return Response(self._written, media_type="application/json")
 
         self.add_route("/openapi.json", answer, include_in_schema=False)
 
-    @cache  # noqa: B019  there is one app as long as the process lives
+    @cached_property
     def _written(self) -> bytes:
         return bytes(JSONResponse(self.openapi()).body)
 

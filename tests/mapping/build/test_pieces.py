@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -79,13 +80,13 @@ def in_one_folder(samples: Sequence[Path], root: Path) -> Path:
 
 
 def build(dataset: Path, maps: Path, **changes: object) -> Map:
-    values: dict[str, object] = {
+    values: dict[str, Any] = {
         "method": "sfm",
         "local_features": "xfeat",
         "max_keypoints": 1500,
         "sfm": SfmSettings(poses="estimate"),
     } | changes
-    settings = BuildSettings(dataset, "home", maps, **values)  # type: ignore[arg-type]
+    settings = BuildSettings(dataset, "home", maps, **values)
     return open_map(build_map(settings, lambda *_: None))
 
 
