@@ -10,7 +10,7 @@ PAGE_SOURCES := $(shell find web/src web/index.html web/*.json web/*.ts -type f)
 .DEFAULT_GOAL := help
 # Vite needs this much; without it the service has no page, and says so.
 NODE_IS_THERE = command -v npm >/dev/null && node -e 'const [a, b] = process.versions.node.split(".").map(Number); process.exit(a > 22 || (a === 22 && b >= 12) || (a === 20 && b >= 19) ? 0 : 1)'
-.PHONY: help install licences-check page check-page browser balancer promtool demo test test-all docs-check docs-errors docs-options licences lock sbom audit fuzz fuzz-api train-smoke bench bench-gpu bench-scale bench-change trust fmt lint types contracts proto proto-check check serve clean
+.PHONY: help install licences-check page check-page browser balancer promtool demo test test-all docs-check docs-errors docs-options licences lock sbom audit fuzz fuzz-api train-smoke bench bench-gpu bench-scale bench-change trust fmt lint types contracts proto proto-check site docs-links check serve clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "%-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -80,6 +80,12 @@ test-all: install browser balancer promtool ## the slow tests too
 
 docs-check: install ## run the commands that the docs print, or parse those that take hours: PAGES
 	$(BIN)/python -m tests.docs_check $(PAGES)
+
+site: install ## write the documentation as a site to .site, with warnings as errors
+	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going -c docs_site . .site
+
+docs-links: install ## ask the hosts that the documentation links to
+	$(BIN)/python -m sphinx --quiet -b linkcheck -c docs_site . .site-links
 
 docs-errors: install ## write the tables of error codes from visloc/error_codes.toml
 	$(BIN)/python -m tests.error_docs
@@ -164,10 +170,10 @@ check-page: page ## types, format and unit tests of web/
 licences-check: install ## dependencies have licences that the policy allows
 	$(BIN)/python -m supply_chain.licences
 
-check: lint types contracts licences-check proto-check check-page ## what must be green before review
+check: lint types contracts licences-check proto-check check-page site ## what must be green before review
 
 serve: install ## serve the maps in maps/ on 127.0.0.1:8000 (HTTP) and :50051 (gRPC)
 	$(BIN)/python -m service --maps-dir maps
 
 clean: ## remove what make made
-	rm -rf $(VENV) .sbom .demo .bench .change .trust web/node_modules visloc_web/built
+	rm -rf $(VENV) .site .site-links .sbom .demo .bench .change .trust web/node_modules visloc_web/built

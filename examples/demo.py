@@ -31,7 +31,7 @@ ROOT = Path(".demo")
 DATASET, MAPS = ROOT / "dataset", ROOT / "maps"
 REPORT, POSES, PICTURE = ROOT / "report.json", ROOT / "poses.txt", ROOT / "picture.png"
 SERVICE_LOG = ROOT / "service.log"
-# Photos of one moment under short names, for the commands of README.md and docs/api.md.
+# Photos of one moment under short names, for the commands of docs/first-steps.md and docs/api.md.
 PHOTOS = {"left": ROOT / "photo.jpg", "right": ROOT / "right.jpg"}
 COMMANDS = Path(sys.executable).parent
 READY_WITHIN_S = 60

@@ -41,6 +41,7 @@ from samples.trajectories import mapping_trajectory, stereo_rig
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = (
     ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
     *sorted((ROOT / "docs").rglob("*.md")),
     ROOT / "examples" / "plugin" / "README.md",
 )
@@ -90,7 +91,7 @@ def commands_of(page: Path) -> list[Command]:
     """Read the commands of a page in their order: of its blocks, then those in sentences."""
     text, name = page.read_text(encoding="utf-8"), page.relative_to(ROOT).as_posix()
     found = []
-    for block in re.finditer(r"^```(\w*)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL):
+    for block in re.finditer(r"^```(\S*)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL):
         language, body = block.groups()
         line = text.count("\n", 0, block.start()) + 2
         if language == "python":

@@ -46,8 +46,8 @@ from visloc_api.words.sequences import LocalizeSequenceRequest
 from visloc_api.words.status import Problem
 
 ROOT = Path(__file__).resolve().parents[1]
-README, API = ROOT / "README.md", ROOT / "docs" / "api.md"
-PAGES = [README, ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md"))]
+FIRST_STEPS, API = ROOT / "docs" / "first-steps.md", ROOT / "docs" / "api.md"
+PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
 COMMANDS = Path(sys.executable).parent
 
 # Reading
@@ -55,7 +55,7 @@ COMMANDS = Path(sys.executable).parent
 
 def blocks(page: Path, language: str) -> list[str]:
     """The fenced blocks of a language; shell has none."""
-    found = re.findall(r"^```(\w*)\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL)
+    found = re.findall(r"^```(\S*)\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL)
     return [text for name, text in found if name == language]
 
 
@@ -134,7 +134,7 @@ class Desk:
 def desk(
     sample: Path, built_maps: Path, query: Any, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Desk]:
-    """The folder that README.md assumes, and the service as README.md starts it."""
+    """The folder that docs/first-steps.md assumes, and the service as it starts it."""
     folder = tmp_path_factory.mktemp("desk")
     for name, target in (
         ("maps", built_maps),
@@ -158,7 +158,7 @@ def desk(
     (folder / "RECORDING").mkdir()
     (folder / "RECORDING" / "photo.jpg").write_bytes(query.image)
     (folder / "RECORDING" / "transforms.json").write_text(json.dumps(recording))
-    (line,) = (line for line in shell_lines(README) if "visloc-service" in line)
+    (line,) = (line for line in shell_lines(FIRST_STEPS) if "visloc-service" in line)
     arguments = line.replace("8000", "0").replace("50051", "0").split()
     arguments[0] = f"{COMMANDS}/visloc-service"
     with subprocess.Popen(arguments, cwd=folder, stderr=subprocess.PIPE, text=True) as process:
@@ -341,7 +341,8 @@ def test_no_page_hides_a_program_that_nobody_knows(page: str) -> None:
 
 def test_every_make_target_exists() -> None:
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.M))
-    named = {word for text in in_pages(r"`(make [a-z -]+)`") for word in text.split()[1:]}
+    printed = in_pages(r"`(make [a-z -]+)`") + in_pages(r"^(make [a-z -]*[a-z])")
+    named = {word for text in printed for word in text.split()[1:]}
 
     assert {"demo", "test", "install"} <= named <= targets
 
@@ -382,6 +383,11 @@ def test_every_variable_of_the_environment_is_a_setting() -> None:
     assert set(in_pages(rf"{PREFIX}[A-Z_]+")) <= {*known, CONFIG_VARIABLE, KEY_VARIABLE}
 
 
+def anchor_of(heading: str) -> str:
+    """The anchor that GitHub and the site give a heading."""
+    return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_every_relative_link_leads_somewhere(page: Path) -> None:
     for link in re.findall(r"\]\((?!\w+:)([^)]+)\)", page.read_text()):
@@ -390,7 +396,7 @@ def test_every_relative_link_leads_somewhere(page: Path) -> None:
         assert target.exists(), link
         if anchor:
             headings = re.findall(r"^#+ (.*)", target.read_text(), re.M)
-            assert anchor in {heading.lower().replace(" ", "-") for heading in headings}, link
+            assert anchor in {anchor_of(heading) for heading in headings}, link
 
 
 # docs/api.md and the code

@@ -1,0 +1,1 @@
+"""The site that ``make site`` writes: Sphinx over README.md and docs/."""
