@@ -82,10 +82,10 @@ docs-check: install ## run the commands that the docs print, or parse those that
 	$(BIN)/python -m tests.docs_check $(PAGES)
 
 site: install ## write the documentation as a site to .site, with warnings as errors
-	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going -c docs_site . .site
+	PYTHONPATH=. $(BIN)/sphinx-build --quiet --fail-on-warning --keep-going -c docs_site . .site
 
 docs-links: install ## ask the hosts that the documentation links to
-	$(BIN)/python -m sphinx --quiet -b linkcheck -c docs_site . .site-links
+	PYTHONPATH=. $(BIN)/sphinx-build --quiet -b linkcheck -c docs_site . .site-links
 
 docs-errors: install ## write the tables of error codes from visloc/error_codes.toml
 	$(BIN)/python -m tests.error_docs
