@@ -30,7 +30,7 @@ def create_app(backend: Backend) -> App:
         title="visloc",
         version=visloc.__version__,
         summary="Localizes photos in maps of posed photos.",
-        docs_url=None,  # its page loads scripts from another host
+        docs_url=None,  # loads scripts from another host; ours are in static_page
         redoc_url=None,
         redirect_slashes=False,  # the target would be built from the caller's Host header
     )

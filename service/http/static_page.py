@@ -1,4 +1,4 @@
-"""The page at ``/``: the built files of ``web/``, read once and kept in memory."""
+"""The pages at ``/``, ``/docs`` and ``/redoc``: the built files of ``web/``, kept in memory."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from visloc_web import page_folder
 
 logger = logging.getLogger(__name__)
 
-INDEX = "index.html"
+# Path by file. Swagger UI and ReDoc are to be found where other FastAPI services have them.
+PAGES = {"/": "index.html", "/docs": "docs.html", "/redoc": "redoc.html"}
 # Written out because `mimetypes` depends on the machine.
 _TYPES = {
     ".css": "text/css; charset=utf-8",
@@ -31,10 +32,19 @@ _TYPES = {
 }
 _COMPRESSED_ALREADY = (".png", ".woff2")
 # No content from other hosts, no inline scripts, no framing.
+_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; "
+    "media-src 'self' blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'"
+)
+# Swagger UI and ReDoc write styles and small pictures into themselves; ReDoc searches in a worker.
+_POLICY_OF_REFERENCE = (
+    _POLICY.replace("style-src 'self'", "style-src 'self' 'unsafe-inline'").replace(
+        "img-src 'self' blob:", "img-src 'self' data:"
+    )
+    + "; worker-src blob:"
+)
 _SAFE = {
-    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
-    "img-src 'self' blob:; media-src 'self' blob:; connect-src 'self'; base-uri 'none'; "
-    "form-action 'none'; frame-ancestors 'none'",
     "Cross-Origin-Opener-Policy": "same-origin",
     "Permissions-Policy": "camera=(self)",
     "Referrer-Policy": "no-referrer",
@@ -59,18 +69,22 @@ class _File:
 
 
 def add_page_routes(app: FastAPI) -> None:
-    """Serve the page. If it was not built, log that and answer 404."""
+    """Serve the pages. If they were not built, log that and answer 404."""
     try:
-        index, assets = _read(page_folder())
+        pages, assets = _read(page_folder())
     except Unavailable as error:
         logger.warning("no page at /: %s", error)
-        index, assets = None, {}
+        pages, assets = {}, {}
 
-    @app.api_route("/", methods=_READING, include_in_schema=False)
     async def page(request: Request) -> Response:
-        if index is None:
+        path = request.scope["path"]
+        if path not in pages:
             raise refuse("page.not_built")
-        return _answer(index, request, ASK_ALWAYS)
+        policy = _POLICY if path == "/" else _POLICY_OF_REFERENCE
+        return _answer(pages[path], request, ASK_ALWAYS, policy)
+
+    for path in PAGES:
+        app.add_api_route(path, page, methods=_READING, include_in_schema=False)
 
     @app.api_route("/assets/{name}", methods=_READING, include_in_schema=False)
     async def asset(request: Request, name: str) -> Response:
@@ -79,10 +93,10 @@ def add_page_routes(app: FastAPI) -> None:
         return _answer(assets[name], request, FOR_EVER)  # names contain a hash of the content
 
 
-def _read(folder: Path) -> tuple[_File, Mapping[str, _File]]:
-    """Read the index, and the assets by name: a requested name never becomes a path."""
+def _read(folder: Path) -> tuple[Mapping[str, _File], Mapping[str, _File]]:
+    """Read the pages, and the assets by name: a requested name never becomes a path."""
     assets = {path.name: _read_file(path) for path in sorted((folder / "assets").glob("*"))}
-    return _read_file(folder / INDEX), assets
+    return {path: _read_file(folder / name) for path, name in PAGES.items()}, assets
 
 
 def _read_file(path: Path) -> _File:
@@ -92,9 +106,13 @@ def _read_file(path: Path) -> _File:
     return _File(plain, packed, content_type, hashlib.sha256(plain).hexdigest()[:32])
 
 
-def _answer(file: _File, request: Request, cache_control: str) -> Response:
+def _answer(file: _File, request: Request, cache_control: str, policy: str = _POLICY) -> Response:
     body, etag = file.plain, f'"{file.etag}"'
-    headers = _SAFE | {"Cache-Control": cache_control, "Vary": "Accept-Encoding"}
+    headers = _SAFE | {
+        "Content-Security-Policy": policy,
+        "Cache-Control": cache_control,
+        "Vary": "Accept-Encoding",
+    }
     if file.compressed is not None and takes_gzip(request.headers):
         body, etag = file.compressed, f'"{file.etag}-gzip"'
         headers["Content-Encoding"] = "gzip"

@@ -42,6 +42,7 @@ _SCOPES_OF_CALLS = {
     **{f"/{_MAPS}/{name}": Scope.MANAGE for name in ("PutVersion", "DeleteVersion", "SetCurrent")},
 }
 
+_PAGES = frozenset({"/", "/docs", "/redoc"})
 _ASSET = re.compile(r"/assets/[^/]+")
 _ORIGIN = re.compile(r"https?://[A-Za-z0-9.-]+(:\d{1,5})?|https?://\[[0-9a-f:]+\](:\d{1,5})?")
 
@@ -68,7 +69,7 @@ def needed_over_http(method: str, path: str, *, page: bool = False) -> Needed:
 def _is_of_page(method: str, path: str) -> bool:
     if method not in _READING_METHODS:
         return False
-    return path == "/" or _ASSET.fullmatch(path) is not None
+    return path in _PAGES or _ASSET.fullmatch(path) is not None
 
 
 def needed_over_grpc(method: str) -> Needed:

@@ -170,6 +170,10 @@ def assert_is_quiet(seen: dict[str, Any]) -> None:
 @pytest.mark.parametrize("part", ["page", "report"])
 def test_the_bundle_is_under_a_megabyte_compressed(part: str) -> None:
     files = [path for path in (BUILT / part).rglob("*") if path.is_file()]
+    if part == "page":  # without what only /docs and /redoc load
+        index = (BUILT / part / "index.html").read_text()
+        files = [path for path in files if path.name == "index.html" or path.name in index]
+        assert len(files) > 3
     assert 0 < sum(len(gzip.compress(path.read_bytes())) for path in files) < 1_000_000
 
 
@@ -185,6 +189,18 @@ def test_the_landmarks_of_a_chosen_map_come(browser: Browser) -> None:
     assert seen["statistics"]["pointsDrawn"] > 0
     for fact in (grouped(seen["map"]["landmarks"]), seen["map"]["version"], "sift"):
         assert fact in seen["panel"]
+
+
+# References of the API
+
+
+def test_swagger_ui_and_redoc_show_the_routes_and_ask_nobody_else(browser: Browser) -> None:
+    seen = browser.see("reference")
+
+    assert seen["docs"]["answer"].split()[0] == "200"
+    for page in (seen["docs"], seen["redoc"]):
+        assert_is_quiet(page)
+        assert "/localize/sequence" in page["text"]
 
 
 # Photo

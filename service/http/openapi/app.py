@@ -101,6 +101,9 @@ class App(FastAPI):
             )
             schema["components"]["schemas"].update(ours["$defs"])
             schema["components"]["schemas"]["Problem"]["example"] = example("problem")
+            key = {"type": "http", "scheme": "bearer", "description": "an API key"}
+            schema["components"]["securitySchemes"] = {"key": key}
+            schema["security"] = [{}, {"key": []}]  # a server may want none
             # Added here, because FastAPI drops nulls from the examples of routes.
             for (path, method, status), shown in _ANSWERS.items():
                 response = schema["paths"][path][method]["responses"][status]

@@ -45,6 +45,8 @@ def built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder = tmp_path / "page"
     (folder / "assets").mkdir(parents=True)
     (folder / "index.html").write_bytes(INDEX)
+    (folder / "docs.html").write_bytes(b"<!doctype html>Swagger UI")
+    (folder / "redoc.html").write_bytes(b"<!doctype html>ReDoc")
     (folder / "assets" / "index-1a2b.js").write_bytes(SCRIPT)
     (folder / "assets" / "index-3c4d.css").write_bytes(b"body { color: black }")
     (folder / "assets" / "logo.png").write_bytes(LOGO)
@@ -115,6 +117,18 @@ def test_the_files_are_served_with_what_they_are_and_may_do(
     assert answer.headers["referrer-policy"] == "no-referrer"
     assert answer.headers["permissions-policy"] == "camera=(self)"
     assert answer.headers["cross-origin-opener-policy"] == "same-origin"
+
+
+@pytest.mark.parametrize("path", ["/docs", "/redoc"])
+def test_the_references_may_style_themselves_but_run_no_foreign_script(path: str) -> None:
+    answer = ask(app_with(), path)
+
+    assert answer.status_code == 200
+    assert answer.headers["content-type"] == "text/html; charset=utf-8"
+    rules = answer.headers["content-security-policy"].split("; ")
+    assert {"default-src 'none'", "script-src 'self'", "connect-src 'self'"} <= set(rules)
+    assert [rule for rule in rules if "unsafe" in rule] == ["style-src 'self' 'unsafe-inline'"]
+    assert not any("http" in rule for rule in rules)
 
 
 @pytest.mark.parametrize("path", ["/", "/assets/index-1a2b.js"])
@@ -268,7 +282,7 @@ def test_requests_for_files_are_counted_under_few_names() -> None:
 
 
 def test_gzip_holds_the_same_bytes_every_time(built: Path) -> None:
-    first, second = (service.http.static_page._read(built)[0] for _ in range(2))
+    first, second = (service.http.static_page._read(built)[0]["/"] for _ in range(2))
 
     assert first.compressed == second.compressed
     assert first.compressed is not None
