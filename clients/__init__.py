@@ -1,6 +1,7 @@
 """Clients of the localization service: synchronous and asynchronous, over HTTP and gRPC."""
 
 from clients.client import AsyncClient, Client
+from clients.frames import Axes, blended, camera_matrix, session_from_map
 from clients.wire.answers import ImageResult, InstantResult, LocalizeResult, ServerInfo
 from clients.wire.features import Features
 from clients.wire.rigs import Instant, Rig, RigImage
@@ -24,6 +25,7 @@ from visloc_api.words.poses import PoseEstimate, RigPose
 __all__ = [
     "Anchor",
     "AsyncClient",
+    "Axes",
     "CameraUsed",
     "Client",
     "Debug",
@@ -60,4 +62,7 @@ __all__ = [
     "ServerInfo",
     "TileInfo",
     "VersionInfo",
+    "blended",
+    "camera_matrix",
+    "session_from_map",
 ]
