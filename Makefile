@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 # What is made last of it.
 PAGE := visloc_web/built/report/report.js
-PAGE_SOURCES := $(shell find web/src web/index.html web/*.json web/*.ts -type f)
+PAGE_SOURCES := $(shell find web/src web/*.html web/*.json web/*.ts -type f)
 
 .DEFAULT_GOAL := help
 # Vite needs this much; without it the service has no page, and says so.
@@ -21,7 +21,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "visloc needs Python 3.11 or newer")'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt \
-		--editable '.[mapping,service,gem,s3,cluster,tracing,clients,compare,dev]'
+		--editable '.[mapping,service,gem,s3,cluster,tracing,clients,compare,ros,dev]'
 	touch $(INSTALLED)
 
 page: ## build the page from web/

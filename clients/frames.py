@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from visloc.errors import refuse
 from visloc.geometry import Pose
+from visloc.sequences.filling import interpolate_pose
 from visloc_api.words.poses import PoseEstimate
 
 
@@ -91,13 +92,8 @@ def blended(old: ArrayLike, new: ArrayLike, share: float) -> NDArray[np.float64]
     first, second = np.asarray(old, dtype=np.float64), np.asarray(new, dtype=np.float64)
     for each in (first, second):
         _check_rigid(each)
-    q, p = (Pose(each[:3, :3], each[:3, 3]).rotation_wxyz for each in (first, second))
-    cosine = float(q @ p)
-    p, angle = np.copysign(1.0, cosine) * p, np.arccos(min(1.0, abs(cosine)))
-    if angle > 1e-9:
-        q = (np.sin((1 - share) * angle) * q + np.sin(share * angle) * p) / np.sin(angle)
-    position = (1 - share) * first[:3, 3] + share * second[:3, 3]
-    between = Pose.from_quaternion(q / np.linalg.norm(q), position)
+    start, end = (Pose(each[:3, :3], each[:3, 3]).inverse() for each in (first, second))
+    between = interpolate_pose(start, end, share).inverse()
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = between.rotation, between.translation
     return matrix

@@ -19,7 +19,10 @@ from supply_chain.dependencies import IMAGES, ROOT, of_extras, pinned
 
 POLICY = ROOT / "supply_chain" / "policy.toml"
 PAGE = ROOT / "docs" / "licences.md"
-_EXTRAS = ("mapping", "service", "gem", "s3", "cluster", "tracing", "clients", "compare", "dev")
+_EXTRAS = (
+    *("mapping", "service", "gem", "s3", "cluster", "tracing", "clients", "compare", "ros"),
+    "dev",
+)
 
 _HEADER = """# Licences
 

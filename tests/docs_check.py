@@ -146,6 +146,7 @@ RULES = (
     Rule(Tier.ELSEWHERE, r"", r"curl .*//maps\.example\.org", "a host of that name"),
     Rule(Tier.PARSED, r"", r"([A-Z]+=\S+ |[A-Z]+=\".*\" )?make ", "a target of its own"),
     Rule(Tier.PARSED, r"examples/plugin", r"", "needs it installed; tests/examples/test_plugin.py"),
+    Rule(Tier.PARSED, r"ar-and", r"(mapping import|localize bag)", "needs bags; test_rosbag.py"),
     Rule(Tier.PARSED, r"map-sets", r"mapping (set|split)", _PLACES),
     Rule(Tier.PARSED, r"mapping\.md", r"mapping capture", "the tutorial runs it"),
     Rule(Tier.PARSED, r"your-room", r".* PHOTOS ", "minutes more; tests/mapping/capture"),

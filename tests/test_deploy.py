@@ -347,7 +347,7 @@ def test_a_wheel_carries_the_built_page_and_the_report_and_nothing_else_of_web(
     tmp_path: Path,
 ) -> None:
     built = ROOT / "visloc_web" / "built"
-    if not (built / "page" / "index.html").is_file():
+    if not (built / "page" / "redoc.html").is_file():
         pytest.skip("the page is not built: `make page`, where Node.js is")
     subprocess.run(
         [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)],

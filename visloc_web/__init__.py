@@ -13,12 +13,12 @@ _BUILT = Path(__file__).parent / "built"
 
 
 def page_folder() -> Path:
-    """Return the folder of the page: ``index.html``, and all else in ``assets/``.
+    """Return the folder of the pages: ``index.html`` and others, and all else in ``assets/``.
 
     Raises:
         Unavailable: ``page.not_built``.
     """
-    return _built("page", "index.html")
+    return _built("page", "redoc.html")
 
 
 def report_parts() -> tuple[str, str]:

@@ -11,6 +11,7 @@ from typing import Annotated, NoReturn
 import typer
 from rich.console import Console
 
+from clients.cli.bag import bag
 from clients.cli.compare import compare
 from clients.cli.dataset import benchmark, localize_batch
 from clients.cli.display import UNKNOWN_UNIT, print_line, print_result, unit_of
@@ -116,6 +117,7 @@ app.command("batch")(localize_batch)
 app.command()(benchmark)
 app.add_typer(maps_app, name="maps")
 app.command()(compare)
+app.command()(bag)
 
 
 def _unit(client: Client, map_ref: str) -> str:

@@ -41,6 +41,7 @@ IMPORTERS: Mapping[str, tuple[str, str]] = {
     "nvm": ("mapping.importers.nvm", "read"),
     "openmvg": ("mapping.importers.openmvg", "read"),
     "opensfm": ("mapping.importers.opensfm", "read"),
+    "rosbag": ("mapping.importers.rosbag", "read"),
 }
 
 

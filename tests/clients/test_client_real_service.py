@@ -13,13 +13,17 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from clients import AsyncClient, Client, Instant, Odometry, PoseSource, RigImage, RigSensor
 from clients.cli.main import main
+from tests.rosbags_made import BASE, BASE_FROM_OPTICAL, write_bag
 from visloc.errors import InvalidInput
 from visloc.evaluation import pose_error
 from visloc.geometry import Pose
+from visloc.kapture import read_dataset
+from visloc.rosbag import open_bag
 
 READY = re.compile(r"ready: (http://127\.0\.0\.1:\d+) (grpc://127\.0\.0\.1:\d+)")
 START = 1_700_000_000_000  # milliseconds
@@ -205,3 +209,43 @@ def test_all_modes_of_a_benchmark(
     assert modes["gp3p"]["instants"] == {"asked": 2, "localized": 2}
     for m in modes.values():
         assert m["position_error_m"]["max"] < 0.01
+
+
+@pytest.mark.parametrize("ros1", [True, False])
+def test_a_bag_becomes_a_bag_of_poses(
+    doors: tuple[str, str], sample: Path, tmp_path: Path, ros1: bool
+) -> None:
+    queries = read_dataset(sample / "query")
+    bag, poses = tmp_path / "walk", tmp_path / ("poses.bag" if ros1 else "poses")
+    write_bag(bag, queries, ros1=False, compressed=ros1, depth=False)
+    first = queries.images[0].sensor_id
+    truth = [queries.pose(r) for r in queries.images if r.sensor_id == first]
+
+    with pytest.raises(SystemExit) as ended:
+        main(
+            [
+                "bag",
+                str(bag),
+                "--map",
+                "room",
+                "--output",
+                str(poses),
+                *("--frame", BASE, "--server", doors[0]),
+            ]
+        )
+
+    assert ended.value.code == 0
+    with open_bag(poses) as opened:
+        messages = [message for _, message in opened.messages(["/visloc/pose"])]
+    assert len(messages) == len(truth)
+    for number, (message, true) in enumerate(zip(messages, truth, strict=True)):
+        assert true is not None
+        base_in_map = true.inverse() @ BASE_FROM_OPTICAL.inverse()
+        assert message.header.stamp.sec == number + 1
+        at = message.pose.pose
+        q = at.orientation
+        position = (at.position.x, at.position.y, at.position.z)
+        found = Pose.from_quaternion((q.w, q.x, q.y, q.z), position)
+        np.testing.assert_allclose(found.translation, base_in_map.translation, atol=0.05)
+        np.testing.assert_allclose(found.rotation, base_in_map.rotation, atol=0.05)
+        assert np.linalg.eigvalsh(np.reshape(message.pose.covariance, (6, 6))).min() > 0

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -51,6 +51,7 @@ def in_frame_of(axes: Axes, point: Matrix) -> Matrix:
 
 
 @pytest.mark.parametrize("axes", Axes)
+@settings(deadline=None)
 @given(rigid(), st.tuples(st.floats(-1, 1), st.floats(-1, 1), st.floats(1, 9)))
 def test_the_matrix_shows_a_point_of_the_map_where_the_photo_shows_it(
     axes: Axes, cam_from_map: Matrix, beheld: tuple[float, float, float]
@@ -64,6 +65,7 @@ def test_the_matrix_shows_a_point_of_the_map_where_the_photo_shows_it(
 
 
 @pytest.mark.parametrize("axes", Axes)
+@settings(deadline=None)
 @given(rigid(), rigid())
 def test_the_map_is_found_where_it_lies_in_the_session(
     axes: Axes, cam_from_map: Matrix, truth: Matrix
@@ -74,6 +76,7 @@ def test_the_map_is_found_where_it_lies_in_the_session(
     np.testing.assert_allclose(session_from_map(session_from_camera, pose, axes), truth, atol=1e-6)
 
 
+@settings(deadline=None)
 @given(rigid(), rigid(), rigid())
 def test_the_device_may_have_moved_on_when_the_answer_comes(
     cam_from_map: Matrix, truth: Matrix, moved: Matrix
@@ -88,6 +91,7 @@ def test_the_device_may_have_moved_on_when_the_answer_comes(
     np.testing.assert_allclose(map_from_device, expected, atol=1e-6)
 
 
+@settings(deadline=None)
 @given(rigid(), rigid())
 def test_unity_and_opengl_place_the_same_point_of_the_map_alike(
     cam_from_map: Matrix, session_from_camera: Matrix
@@ -101,6 +105,7 @@ def test_unity_and_opengl_place_the_same_point_of_the_map_alike(
     np.testing.assert_allclose(in_unity @ (mirrored @ point), mirrored @ right_handed, atol=1e-6)
 
 
+@settings(deadline=None)
 @given(rigid(), rigid())
 def test_map_from_odom_is_found_through_ros_optical_frame(
     base_in_map: Matrix, odom_from_map: Matrix
@@ -118,6 +123,7 @@ def test_map_from_odom_is_found_through_ros_optical_frame(
     np.testing.assert_allclose(map_from_odom @ odom_from_base, base_in_map, atol=1e-6)
 
 
+@settings(deadline=None)
 @given(rigid(), rigid(), st.floats(0, 1))
 def test_blending_goes_straight_from_one_transform_to_the_other(
     old: Matrix, new: Matrix, share: float

@@ -1,0 +1,216 @@
+"""ROS 1 and ROS 2 bags: photos, cameras, depth, and poses from tf or odometry.
+
+Photos are written to a folder, as published where they were compressed, else as PNG. The world is
+the outermost frame above the cameras, such as ``map`` or ``odom`` (REP 105).
+"""
+
+from __future__ import annotations
+
+import re
+from bisect import bisect_left
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mapping.importers.dataset import depth_sensor_id
+from mapping.importers.model import ImportedImage, ImportedModel
+from mapping.importers.reading.photo_names import photo_size
+from mapping.stages.depth import DEFAULT_DEPTH_SCALE
+from visloc.errors import refuse
+from visloc.geometry import Camera, Pose, rotation_angle
+from visloc.kapture import Sensor
+from visloc.kapture.dataset import UNKNOWN_CAMERA
+from visloc.rosbag import Bag, Picture, depth_in_metres, open_bag
+
+# A photo is taken when the camera has moved so far since the last one.
+_STEP_M, _TURN_RAD = 0.25, np.radians(10.0)
+# Without poses, when so long has passed.
+_STEP_NS = 500_000_000
+_SAME_TIME_NS = 20_000_000  # a depth picture of the same moment
+
+
+@dataclass(slots=True)
+class _Topic:
+    """A topic of photos, and what was taken of it.
+
+    Attributes:
+        last: the photo that was taken last: its time, and ``world_from_cam``.
+    """
+
+    name: str
+    world: str | None = None
+    last: tuple[int, Pose | None] | None = None
+    seen: int = 0
+    unposed: int = 0
+    frame: str = ""
+    size: tuple[int, int] | None = None
+    images: list[ImportedImage] = field(default_factory=list)
+
+    @property
+    def sensor(self) -> str:
+        return re.sub(r"[^\w.-]+", "_", self.name.strip("/"))
+
+
+def read(path: Path, photos: Path | None = None) -> ImportedModel:
+    """Read a bag, and write its photos.
+
+    Args:
+        path: a ``.bag`` of ROS 1, or the folder of a ROS 2 bag.
+        photos: the folder that the photos are written to; None makes ``<bag>_photos`` beside it.
+
+    Raises:
+        DatasetError: ``bag.*``; ``bag.no_photos`` if no topic holds photos.
+        Unavailable: ``bag.no_rosbags``.
+    """
+    with open_bag(path) as bag:
+        if not bag.photos:
+            raise refuse("bag.no_photos", field=str(path))
+        folder = path.with_name(f"{path.stem}_photos") if photos is None else photos
+        topics = {name: _Topic(name) for name in bag.photos}
+        for picture in bag.pictures(bag.photos):
+            _take(bag, topics[picture.topic], picture, folder)
+        depth_topics = _add_depth(bag, topics.values(), folder)
+        return _model(bag, list(topics.values()), depth_topics, folder)
+
+
+def _take(bag: Bag, topic: _Topic, picture: Picture, folder: Path) -> None:
+    """Write a photo and note it, unless the camera has hardly moved since the last."""
+    topic.seen += 1
+    if not topic.frame:
+        topic.frame = picture.frame
+        if bag.transforms.moves(picture.frame):
+            topic.world = bag.transforms.root_of(picture.frame)
+    world_from_cam = None
+    if topic.world is not None:
+        world_from_cam = bag.transforms.pose(topic.world, picture.frame, picture.time_ns)
+        if world_from_cam is None:
+            topic.unposed += 1
+            return
+    if not _is_new(topic.last, picture.time_ns, world_from_cam):
+        return
+    name = f"{topic.sensor}/{picture.time_ns}{_suffix(picture)}"
+    _write(folder / name, picture)
+    size = photo_size(folder / name)
+    if size is None:
+        raise refuse("bag.picture", field=topic.name, expected="JPEG or PNG", got="neither")
+    topic.size = size
+    topic.last = picture.time_ns, world_from_cam
+    pose = None if world_from_cam is None else world_from_cam.inverse()
+    topic.images.append(ImportedImage(name, topic.sensor, picture.time_ns, pose))
+
+
+def _is_new(last: tuple[int, Pose | None] | None, time_ns: int, pose: Pose | None) -> bool:
+    if last is None:
+        return True
+    if pose is None or last[1] is None:
+        return time_ns - last[0] >= _STEP_NS
+    if time_ns == last[0]:
+        return False
+    moved = float(np.linalg.norm(pose.translation - last[1].translation))
+    return moved >= _STEP_M or rotation_angle(pose.rotation @ last[1].rotation.T) >= _TURN_RAD
+
+
+def _suffix(picture: Picture) -> str:
+    if picture.encoded is None or picture.encoded.startswith(b"\x89PNG"):
+        return ".png"
+    return ".jpg"
+
+
+def _write(path: Path, picture: Picture) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(picture.file())
+
+
+def _write_depth(path: Path, millimetres: NDArray[np.uint16]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    ok, encoded = cv2.imencode(".png", millimetres)
+    assert ok  # of any array of this kind
+    path.write_bytes(encoded.tobytes())
+
+
+def _add_depth(bag: Bag, topics: Iterable[_Topic], folder: Path) -> dict[str, str]:
+    """Give photos the depth pictures of their frame and moment; return the topic of each sensor."""
+    found: dict[str, str] = {}
+    for depth in bag.depth:
+        for _, message in bag.messages([depth]):
+            frame = message.header.frame_id.lstrip("/")
+            stamp = message.header.stamp
+            time_ns = int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+            for topic in topics:
+                if topic.frame != frame or found.get(topic.sensor, depth) != depth:
+                    continue
+                index = _nearest(topic.images, time_ns)
+                if index is None or topic.images[index].depth is not None:
+                    continue
+                image = topic.images[index]
+                name = f"{depth_sensor_id(topic.sensor)}/{image.timestamp}.png"
+                units = np.round(depth_in_metres(message, depth) / DEFAULT_DEPTH_SCALE)
+                _write_depth(folder / name, np.clip(units, 0, 65535).astype(np.uint16))
+                topic.images[index] = replace(image, depth=name)
+                found[topic.sensor] = depth
+    return found
+
+
+def _nearest(images: list[ImportedImage], time_ns: int) -> int | None:
+    times = [image.timestamp for image in images]
+    after = bisect_left(times, time_ns)
+    near = [i for i in (after - 1, after) if 0 <= i < len(times)]
+    best = min(near, key=lambda i: abs(times[i] - time_ns), default=None)
+    return best if best is not None and abs(times[best] - time_ns) <= _SAME_TIME_NS else None
+
+
+def _model(
+    bag: Bag, topics: list[_Topic], depth_topics: dict[str, str], folder: Path
+) -> ImportedModel:
+    sensors: dict[str, Sensor] = {}
+    notes = []
+    for topic in topics:
+        taken = len(topic.images)
+        notes.append(f"{topic.name}: {taken} of {topic.seen} photos taken, written to {folder}")
+        if topic.unposed:
+            notes.append(f"{topic.name}: {topic.unposed} photos lie outside the time of tf")
+        if topic.world is None:
+            notes.append(f"{topic.name}: nothing tells how its frame {topic.frame!r} moves")
+        else:
+            notes.append(f"{topic.name}: the world is the frame {topic.world!r}")
+        if topic.size is None:
+            continue
+        camera = bag.cameras[topic.name]
+        sensors[topic.sensor] = _sensor(topic.sensor, camera, topic.size, topic.name)
+        if topic.sensor in depth_topics:
+            used = bag.cameras[depth_topics[topic.sensor]] or camera
+            if used is None:
+                raise refuse("bag.no_camera", field=depth_topics[topic.sensor])
+            depth = depth_sensor_id(topic.sensor)
+            sensors[depth] = Sensor.with_camera(depth, used, "depth")
+    worlds = {topic.world for topic in topics if topic.images}
+    if len(worlds) > 1:
+        raise refuse("bag.worlds", field=str(bag.path), got=sorted(map(str, worlds)))
+    images = tuple(image for topic in topics for image in topic.images)
+    if not images:
+        raise refuse("bag.no_photos", "no photo has a pose", field=str(bag.path), got=notes)
+    return ImportedModel(
+        sensors=sensors,
+        images=images,
+        photos=folder,
+        metric=None not in worlds,
+        notes=tuple(notes),
+    )
+
+
+def _sensor(name: str, camera: Camera | None, size: tuple[int, int], topic: str) -> Sensor:
+    if camera is None:
+        return Sensor(name, "", "camera", (UNKNOWN_CAMERA, *map(str, size)), None)
+    if (camera.width, camera.height) != size:
+        raise refuse(
+            "bag.camera",
+            "the camera of a topic is of another size than its photos",
+            field=topic,
+            expected=f"{camera.width} x {camera.height}",
+            got=f"{size[0]} x {size[1]}",
+        )
+    return Sensor.with_camera(name, camera)

@@ -1,0 +1,263 @@
+"""Pictures, cameras, frames and poses of ROS bags."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from visloc.errors import Conflict, DatasetError
+from visloc.geometry import Camera, Pose
+from visloc.pose.colmap import project
+from visloc.rosbag import Picture, PoseStamped, Transforms, camera_from_info, open_bag, write_poses
+from visloc.rosbag.pictures import depth_in_metres, pixels_of
+from visloc.rosbag.writing import ros_covariance
+
+numbers = st.floats(-9, 9)
+quaternions = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q) > 0.1)
+poses = st.builds(Pose.from_quaternion, quaternions, st.tuples(numbers, numbers, numbers))
+
+
+def assert_same(a: Pose, b: Pose) -> None:
+    np.testing.assert_allclose(a.rotation, b.rotation, atol=1e-9)
+    np.testing.assert_allclose(a.translation, b.translation, atol=1e-9)
+
+
+# Frames
+
+
+@settings(deadline=None)
+@given(poses, poses, poses)
+def test_transforms_chain_through_the_tree(a: Pose, b: Pose, c: Pose) -> None:
+    tree = Transforms()
+    tree.add("base", "camera", None, a)
+    tree.add("map", "base", 10, b)
+    tree.add("base", "lidar", None, c)
+
+    found = tree.pose("map", "camera", 10)
+    beside = tree.pose("lidar", "camera", 10)
+
+    assert found is not None
+    assert beside is not None
+    assert_same(found, b @ a)
+    assert_same(beside, c.inverse() @ a)
+    assert tree.root_of("camera") == "map"
+    assert tree.moves("camera")
+    assert not tree.moves("map")
+
+
+def test_poses_between_two_times_are_interpolated_and_none_is_guessed_outside() -> None:
+    tree = Transforms()
+    turned = Pose.from_quaternion((np.cos(0.3), 0, 0, np.sin(0.3)), (2, 0, 0))
+    tree.add("map", "base", 20, turned)  # not in order, as topics may interleave
+    tree.add("map", "base", 10, Pose.identity())
+
+    middle = tree.pose("map", "base", 15)
+
+    assert middle is not None
+    np.testing.assert_allclose(middle.translation, [1, 0, 0], atol=1e-12)
+    half = Pose.from_quaternion((np.cos(0.15), 0, 0, np.sin(0.15)), (1, 0, 0))
+    np.testing.assert_allclose(middle.rotation, half.rotation, atol=1e-12)
+    assert tree.pose("map", "base", 9) is None
+    assert tree.pose("map", "base", 21) is None
+    assert tree.pose("odom", "base", 15) is None
+
+
+def test_a_circle_of_frames_ends() -> None:
+    tree = Transforms()
+    tree.add("a", "b", None, Pose.identity())
+    tree.add("b", "a", None, Pose.identity())
+
+    assert tree.pose("elsewhere", "a", 0) is None
+
+
+# Cameras
+
+
+def info(model: str, d: list[float], width: int = 640, height: int = 480) -> Any:
+    k = np.array([500.0, 0, 319.5, 0, 510, 239.5, 0, 0, 1])
+    return SimpleNamespace(width=width, height=height, distortion_model=model, k=k, d=np.array(d))
+
+
+def test_cameras_count_pixels_from_the_corner() -> None:
+    assert camera_from_info(info("plumb_bob", [0.0] * 5), "/c") == Camera(
+        "PINHOLE", 640, 480, (500.0, 510.0, 320.0, 240.0)
+    )
+
+
+@pytest.mark.parametrize(
+    ("model", "d", "ours"),
+    [
+        ("plumb_bob", [0.1, -0.05, 0.001, 0.002, 0.0], "OPENCV"),
+        ("plumb_bob", [0.1, -0.05, 0.001, 0.002, 0.01], "FULL_OPENCV"),
+        (
+            "rational_polynomial",
+            [0.1, -0.05, 0.001, 0.002, 0.01, 0.02, 0.003, 0.004],
+            "FULL_OPENCV",
+        ),
+        ("equidistant", [0.1, -0.05, 0.001, 0.002], "OPENCV_FISHEYE"),
+    ],
+)
+def test_distortion_is_that_of_opencv(model: str, d: list[float], ours: str) -> None:
+    import cv2
+
+    camera = camera_from_info(info(model, d), "/c")
+    assert camera is not None
+    assert camera.model == ours
+    points = np.array([[0.3, -0.2, 1.0], [-0.1, 0.25, 1.2]])
+    k = info(model, d).k.reshape(3, 3)
+    if model == "equidistant":
+        expected, _ = cv2.fisheye.projectPoints(
+            points[:, None], np.zeros(3), np.zeros(3), k, np.array(d)
+        )
+    else:
+        expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), k, np.array(d))
+    np.testing.assert_allclose(project(camera, points), expected.reshape(-1, 2) + 0.5, atol=1e-6)
+
+
+def test_an_unknown_model_is_named_and_no_calibration_is_no_camera() -> None:
+    with pytest.raises(DatasetError, match=r"'fov' with 1 numbers"):
+        camera_from_info(info("fov", [0.9]), "/c")
+    uncalibrated = info("plumb_bob", [])
+    uncalibrated.k = np.zeros(9)
+    assert camera_from_info(uncalibrated, "/c") is None
+
+
+# Pictures
+
+
+def image(pixels: Any, encoding: str, padding: int = 0, big: bool = False) -> Any:
+    rows = np.ascontiguousarray(pixels).view(np.uint8).reshape(len(pixels), -1)
+    padded = np.pad(rows, ((0, 0), (0, padding)))
+    height, width = pixels.shape[:2]
+    return SimpleNamespace(
+        height=height,
+        width=width,
+        encoding=encoding,
+        is_bigendian=int(big),
+        step=padded.shape[1],
+        data=padded.reshape(-1),
+    )
+
+
+@pytest.mark.parametrize("padding", [0, 5])
+def test_pixels_come_in_the_order_red_green_blue(padding: int) -> None:
+    rgb = np.random.default_rng(0).integers(0, 256, (4, 6, 3), np.uint8)
+    alpha = np.full((4, 6, 1), 9, np.uint8)
+
+    for pixels, encoding in (
+        (rgb, "rgb8"),
+        (rgb[..., ::-1], "bgr8"),
+        (np.concatenate([rgb, alpha], 2), "rgba8"),
+        (np.concatenate([rgb[..., ::-1], alpha], 2), "bgra8"),
+    ):
+        np.testing.assert_array_equal(pixels_of(image(pixels, encoding, padding), "/c"), rgb)
+    np.testing.assert_array_equal(
+        pixels_of(image(rgb[..., 0], "mono8", padding), "/c"), rgb[..., 0]
+    )
+
+
+@pytest.mark.parametrize("shape", [(5, 7, 3), (5, 7)])
+def test_raw_pictures_become_files_without_loss(shape: tuple[int, ...]) -> None:
+    import cv2
+
+    pixels = np.random.default_rng(0).integers(0, 256, shape, np.uint8)
+
+    file = np.frombuffer(Picture("/c", 0, "f", None, pixels).file(), np.uint8)
+
+    read = cv2.imdecode(file, cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(read[..., ::-1] if len(shape) == 3 else read, pixels)
+
+
+@pytest.mark.parametrize("big", [False, True])
+def test_depth_is_in_metres(big: bool) -> None:
+    millimetres = np.array([[0, 1500], [65000, 1]], ">u2" if big else "<u2")
+    metres = np.array([[np.nan, 1.5], [-1.0, np.inf]], ">f4" if big else "<f4")
+
+    from_millimetres = depth_in_metres(image(millimetres, "16UC1", big=big), "/d")
+    from_metres = depth_in_metres(image(metres, "32FC1", big=big), "/d")
+
+    np.testing.assert_allclose(from_millimetres, [[0, 1.5], [65, 0.001]], rtol=1e-6)
+    np.testing.assert_array_equal(from_metres, [[0, 1.5], [0, 0]])
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"encoding": "bayer_rggb8"}, {"step": 3}, {"height": 400}, {"width": 0}]
+)
+def test_a_picture_whose_bytes_do_not_fit_is_refused(wrong: dict[str, Any]) -> None:
+    message = image(np.zeros((4, 6, 3), np.uint8), "rgb8")
+    for name, value in wrong.items():
+        setattr(message, name, value)
+
+    with pytest.raises(DatasetError) as error:
+        pixels_of(message, "/c")
+    assert error.value.code == "bag.picture"
+
+
+# Poses
+
+
+@settings(deadline=None)
+@given(poses, st.integers(0, 2**32 - 1))
+def test_the_covariance_is_that_of_position_and_turn_in_the_world(pose: Pose, seed: int) -> None:
+    factor = np.random.default_rng(seed).normal(size=(6, 6)) * 1e-3
+    covariance = factor @ factor.T
+
+    stated = ros_covariance(pose, covariance)
+
+    # Each column of the factor is one deviation; move the pose by it and look at the device.
+    moved = []
+    for w, dt in zip(factor.T[:, :3] * 1e-3, factor.T[:, 3:] * 1e-3, strict=True):
+        angle = np.linalg.norm(w)
+        turned = Pose.from_quaternion(
+            (np.cos(angle / 2), *np.sin(angle / 2) * w / angle), (0, 0, 0)
+        )
+        other = Pose(turned.rotation @ pose.rotation, pose.translation + dt).inverse()
+        spin = other.rotation @ pose.rotation
+        axis = np.array([spin[2, 1] - spin[1, 2], spin[0, 2] - spin[2, 0], spin[1, 0] - spin[0, 1]])
+        moved.append(np.concatenate([other.translation - pose.center, axis / 2]) * 1e3)
+    deviations = np.array(moved).T
+    np.testing.assert_allclose(stated, deviations @ deviations.T, rtol=1e-2, atol=1e-9)
+
+
+@pytest.mark.parametrize("ros1", [True, False])
+def test_what_is_written_is_read_again(tmp_path: Path, ros1: bool) -> None:
+    path = tmp_path / ("poses.bag" if ros1 else "poses")
+    pose = Pose.from_quaternion((0.5, 0.5, -0.5, 0.5), (1, 2, 3))
+    covariance = np.diag([1e-4, 2e-4, 3e-4, 0.01, 0.02, 0.03])
+
+    write_poses(path, "/pose", "map", [PoseStamped(12_000_000_034, pose, covariance)], ros1=ros1)
+
+    with open_bag(path) as bag:
+        assert bag.photos == ()
+        ((topic, message),) = bag.messages(["/pose"])
+    assert topic == "/pose"
+    assert message.header.frame_id == "map"
+    assert (message.header.stamp.sec, message.header.stamp.nanosec) == (12, 34)
+    at = message.pose.pose
+    np.testing.assert_allclose([at.position.x, at.position.y, at.position.z], pose.center)
+    q = at.orientation
+    read = Pose.from_quaternion((q.w, q.x, q.y, q.z), (0, 0, 0))
+    np.testing.assert_allclose(read.rotation, pose.rotation.T, atol=1e-12)
+    np.testing.assert_allclose(
+        np.reshape(message.pose.covariance, (6, 6)), ros_covariance(pose, covariance)
+    )
+    with pytest.raises(Conflict):
+        write_poses(path, "/pose", "map", [], ros1=ros1)
+
+
+@pytest.mark.parametrize("content", [b"", b"#ROSBAG V2.0\n", b"#ROSBAG V2.0\n" + bytes(5000)])
+def test_a_file_that_is_no_bag_is_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "x.bag"
+    path.write_bytes(content)
+
+    with pytest.raises(DatasetError) as error, open_bag(path):
+        pass
+    assert error.value.code == "bag.unreadable"
+    with pytest.raises(DatasetError, match="nothing there"), open_bag(tmp_path / "none.bag"):
+        pass
