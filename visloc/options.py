@@ -65,6 +65,13 @@ class Matcher(StrEnum):
     LIGHTGLUE = "lightglue"  # the best photos again, by a network made for the local features
 
 
+class Fallback(StrEnum):
+    """What a photo gets that is refused."""
+
+    NONE = "none"
+    COARSE = "coarse"  # a pose told by retrieval alone, with a wide spread; never "localized"
+
+
 class Solver(StrEnum):
     """What searches for a pose among 2D-3D correspondences."""
 
@@ -225,6 +232,12 @@ class LocalizeOptions:
     matcher: Matcher = _option(Matcher.MUTUAL, "how keypoints are matched")
     solver: Solver = _option(Solver.PYCOLMAP, "pose solver")
     seed: int = _option(0, "seed of RANSAC", 0, 2**31 - 1)
+    fallback: Fallback = _option(
+        Fallback.NONE,
+        "what a refused photo gets beside the reason",
+        details="coarse: the pose that the most similar mapping photos suggest, with its spread, "
+        "as an answer of status coarse. Only for a photo on its own, in one map.",
+    )
 
     def __post_init__(self) -> None:
         if self.preset not in PRESETS:

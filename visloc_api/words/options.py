@@ -22,6 +22,7 @@ _MESSAGES = {
     "fusion": "the fusion is unknown",
     "matcher": "the matcher is unknown",
     "solver": "the solver is unknown",
+    "fallback": "the fallback is unknown",
 }
 
 
@@ -120,6 +121,7 @@ class LocalizeOptions(IncomingMessage):
     matcher: Annotated[str | None, _option("matcher")] = None
     solver: Annotated[str | None, _option("solver")] = None
     seed: Annotated[int | None, _option("seed")] = None
+    fallback: Annotated[str | None, _option("fallback")] = None
 
     def to_core(self) -> visloc.options.LocalizeOptions:
         """Return the options, checked."""
