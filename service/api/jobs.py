@@ -139,7 +139,6 @@ def _options_without_fallback(request: LocalizeRigRequest | SequenceStart) -> Lo
     if options.fallback is not Fallback.NONE:
         raise refuse(
             "options.fallback",
-            "retrieval tells the pose of a photo on its own only",
             field="options.fallback",
             expected=f"{Fallback.NONE} for a rig or a sequence",
             got=options.fallback,

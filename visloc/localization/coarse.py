@@ -33,10 +33,10 @@ METHOD = CoarseMethod.BDI
 NUM_AVERAGED = 3
 NUM_SCATTER = 10
 # Trials: photos of the map, each approximated without so many photos nearest to it, itself
-# included, but never without more than a fifth of the map.
+# included, but never without more than a third of the map.
 _MAX_TRIALS = 60
 _LEFT_OUT = (1, 5, 10)
-_LARGEST_SHARE = 5
+_LARGEST_SHARE = 3
 _CERTAIN = 0.95
 _LEAST_VARIANCE = 1e-30  # of a map whose photos were all taken from one pose
 
