@@ -42,7 +42,8 @@ class Inference(StrEnum):
 class Fusion(StrEnum):
     """How similarities under several global descriptors become one ranking.
 
-    Section 3.2 of Humenberger et al. 2020; ``visloc.retrieval.fusion`` has the formulas.
+    Section 4.3 and appendix B of Humenberger et al. 2020; the formulas are in
+    ``visloc.retrieval.fusion``.
     """
 
     GHARM = "gharm"  # generalized harmonic mean
@@ -53,6 +54,7 @@ class Fusion(StrEnum):
     MEAN_AND_POWER = "mean_and_power"
     MIN_AND_MAX = "min_and_max"
     MEAN_AND_MIN = "mean_and_min"
+    VILLENA_ROMAN = "villena_roman"
     HARMONIC = "harmonic"
     ROUND_ROBIN = "round_robin"
 
@@ -143,6 +145,8 @@ PRESETS: Mapping[str, RegistrationPreset] = {
 }
 
 
+DEFAULT_FUSION_PARAMETER = 0.5  # kapture's; the paper names none
+
 _PRESETS_VALUE, _MAPS_VALUE = "the preset's", "the map's"
 
 
@@ -228,6 +232,14 @@ class LocalizeOptions:
         unset=_MAPS_VALUE,
         details="Descriptors without a weight are left out.",
         hash=False,  # a dict
+    )
+    fusion_parameter: float = _option(
+        DEFAULT_FUSION_PARAMETER,
+        "gamma of gharm; beta, at most 1, of the fusions that mix two operators",
+        0.0,
+        100.0,
+        details="Beta is the share of the operator that is named first, and of the quotient in "
+        "villena_roman. Other fusions ignore it.",
     )
     matcher: Matcher = _option(Matcher.MUTUAL, "how keypoints are matched")
     solver: Solver = _option(Solver.PYCOLMAP, "pose solver")

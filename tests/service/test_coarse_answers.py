@@ -16,6 +16,7 @@ from clients.cli.main import app
 from clients.wire.rigs import RigImage
 from visloc.errors import InvalidInput
 from visloc.geometry import Pose, center_covariance
+from visloc.types import RigSensor
 from visloc_api.words.priors import Priors
 
 # No pose has so many inliers.
@@ -79,8 +80,9 @@ def test_places_that_retrieval_cannot_tell_apart_give_none(served: Any, query: A
 
 def test_rigs_and_sequences_have_none(served: Any, query: Any) -> None:
     image = RigImage("camera", query.image, query.camera)
+    rig = {"camera": RigSensor(Pose.identity())}
     with Client(served.url) as client, pytest.raises(InvalidInput) as caught:
-        client.localize_rig([image], "room", {"camera": Pose.identity()}, options=REFUSED)
+        client.localize_rig([image], "room", rig, options=REFUSED)
     assert caught.value.code == "options.fallback"
     with Client(served.url) as client, pytest.raises(InvalidInput) as caught:
         client.localize(query.image, "room", query.camera, {"fallback": "guess"})

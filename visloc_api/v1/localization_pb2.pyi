@@ -89,6 +89,7 @@ class LocalizeOptions(_message.Message):
     EXTRACTION_FIELD_NUMBER: _builtins.int
     FUSION_FIELD_NUMBER: _builtins.int
     FUSION_WEIGHTS_FIELD_NUMBER: _builtins.int
+    FUSION_PARAMETER_FIELD_NUMBER: _builtins.int
     MATCHER_FIELD_NUMBER: _builtins.int
     SOLVER_FIELD_NUMBER: _builtins.int
     SEED_FIELD_NUMBER: _builtins.int
@@ -114,6 +115,8 @@ class LocalizeOptions(_message.Message):
     """effort to find features"""
     fusion: _builtins.str
     """How similarities under several global descriptors become one ranking."""
+    fusion_parameter: _builtins.float
+    """Gamma of gharm; beta, at most 1, of the fusions that mix two operators."""
     matcher: _builtins.str
     """of keypoints"""
     solver: _builtins.str
@@ -141,14 +144,15 @@ class LocalizeOptions(_message.Message):
         extraction: _builtins.str | None = ...,
         fusion: _builtins.str | None = ...,
         fusion_weights: _abc.Mapping[_builtins.str, _builtins.float] | None = ...,
+        fusion_parameter: _builtins.float | None = ...,
         matcher: _builtins.str | None = ...,
         solver: _builtins.str | None = ...,
         seed: _builtins.int | None = ...,
         fallback: _builtins.str | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_extraction", b"_extraction", "_fallback", b"_fallback", "_fusion", b"_fusion", "_matcher", b"_matcher", "_max_error_px", b"_max_error_px", "_min_inlier_ratio", b"_min_inlier_ratio", "_min_inliers", b"_min_inliers", "_min_probability", b"_min_probability", "_preset", b"_preset", "_read_as", b"_read_as", "_seed", b"_seed", "_solver", b"_solver", "_top_k", b"_top_k", "extraction", b"extraction", "fallback", b"fallback", "fusion", b"fusion", "matcher", b"matcher", "max_error_px", b"max_error_px", "min_inlier_ratio", b"min_inlier_ratio", "min_inliers", b"min_inliers", "min_probability", b"min_probability", "preset", b"preset", "read_as", b"read_as", "seed", b"seed", "solver", b"solver", "top_k", b"top_k"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_extraction", b"_extraction", "_fallback", b"_fallback", "_fusion", b"_fusion", "_fusion_parameter", b"_fusion_parameter", "_matcher", b"_matcher", "_max_error_px", b"_max_error_px", "_min_inlier_ratio", b"_min_inlier_ratio", "_min_inliers", b"_min_inliers", "_min_probability", b"_min_probability", "_preset", b"_preset", "_read_as", b"_read_as", "_seed", b"_seed", "_solver", b"_solver", "_top_k", b"_top_k", "extraction", b"extraction", "fallback", b"fallback", "fusion", b"fusion", "fusion_parameter", b"fusion_parameter", "matcher", b"matcher", "max_error_px", b"max_error_px", "min_inlier_ratio", b"min_inlier_ratio", "min_inliers", b"min_inliers", "min_probability", b"min_probability", "preset", b"preset", "read_as", b"read_as", "seed", b"seed", "solver", b"solver", "top_k", b"top_k"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_extraction", b"_extraction", "_fallback", b"_fallback", "_fusion", b"_fusion", "_matcher", b"_matcher", "_max_error_px", b"_max_error_px", "_min_inlier_ratio", b"_min_inlier_ratio", "_min_inliers", b"_min_inliers", "_min_probability", b"_min_probability", "_preset", b"_preset", "_read_as", b"_read_as", "_seed", b"_seed", "_solver", b"_solver", "_top_k", b"_top_k", "extraction", b"extraction", "fallback", b"fallback", "fusion", b"fusion", "fusion_weights", b"fusion_weights", "matcher", b"matcher", "max_error_px", b"max_error_px", "min_inlier_ratio", b"min_inlier_ratio", "min_inliers", b"min_inliers", "min_probability", b"min_probability", "preset", b"preset", "read_as", b"read_as", "seed", b"seed", "solver", b"solver", "top_k", b"top_k"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_extraction", b"_extraction", "_fallback", b"_fallback", "_fusion", b"_fusion", "_fusion_parameter", b"_fusion_parameter", "_matcher", b"_matcher", "_max_error_px", b"_max_error_px", "_min_inlier_ratio", b"_min_inlier_ratio", "_min_inliers", b"_min_inliers", "_min_probability", b"_min_probability", "_preset", b"_preset", "_read_as", b"_read_as", "_seed", b"_seed", "_solver", b"_solver", "_top_k", b"_top_k", "extraction", b"extraction", "fallback", b"fallback", "fusion", b"fusion", "fusion_parameter", b"fusion_parameter", "fusion_weights", b"fusion_weights", "matcher", b"matcher", "max_error_px", b"max_error_px", "min_inlier_ratio", b"min_inlier_ratio", "min_inliers", b"min_inliers", "min_probability", b"min_probability", "preset", b"preset", "read_as", b"read_as", "seed", b"seed", "solver", b"solver", "top_k", b"top_k"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__extraction: _TypeAlias = _typing.Literal["extraction"]  # noqa: Y015
     _WhichOneofArgType__extraction: _TypeAlias = _typing.Literal["_extraction", b"_extraction"]  # noqa: Y015
@@ -156,6 +160,8 @@ class LocalizeOptions(_message.Message):
     _WhichOneofArgType__fallback: _TypeAlias = _typing.Literal["_fallback", b"_fallback"]  # noqa: Y015
     _WhichOneofReturnType__fusion: _TypeAlias = _typing.Literal["fusion"]  # noqa: Y015
     _WhichOneofArgType__fusion: _TypeAlias = _typing.Literal["_fusion", b"_fusion"]  # noqa: Y015
+    _WhichOneofReturnType__fusion_parameter: _TypeAlias = _typing.Literal["fusion_parameter"]  # noqa: Y015
+    _WhichOneofArgType__fusion_parameter: _TypeAlias = _typing.Literal["_fusion_parameter", b"_fusion_parameter"]  # noqa: Y015
     _WhichOneofReturnType__matcher: _TypeAlias = _typing.Literal["matcher"]  # noqa: Y015
     _WhichOneofArgType__matcher: _TypeAlias = _typing.Literal["_matcher", b"_matcher"]  # noqa: Y015
     _WhichOneofReturnType__max_error_px: _TypeAlias = _typing.Literal["max_error_px"]  # noqa: Y015
@@ -182,6 +188,8 @@ class LocalizeOptions(_message.Message):
     def WhichOneof(self, oneof_group: _WhichOneofArgType__fallback) -> _WhichOneofReturnType__fallback | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__fusion) -> _WhichOneofReturnType__fusion | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__fusion_parameter) -> _WhichOneofReturnType__fusion_parameter | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__matcher) -> _WhichOneofReturnType__matcher | None: ...
     @_typing.overload

@@ -118,6 +118,7 @@ class LocalizeOptions(IncomingMessage):
     fusion_weights: Annotated[
         dict[str, float] | None, converted(_check_names), _option("fusion_weights")
     ] = None
+    fusion_parameter: Annotated[float | None, _option("fusion_parameter")] = None
     matcher: Annotated[str | None, _option("matcher")] = None
     solver: Annotated[str | None, _option("solver")] = None
     seed: Annotated[int | None, _option("seed")] = None
