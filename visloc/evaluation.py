@@ -17,7 +17,7 @@ from visloc.errors import refuse
 from visloc.geometry import Pose, center_covariance, rotation_angle
 
 # Below it, chi-square with three degrees of freedom lies with 95 %.
-_CHI2_95_OF_3 = 7.814727903251178
+CHI2_95_OF_3 = 7.814727903251178
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +148,7 @@ def calibration(
         error = pose.center - truth.center
         stated = center_covariance(pose, covariance)[3:, 3:]
         # The pseudo-inverse takes a covariance that is zero along an axis.
-        inside.append(float(error @ np.linalg.pinv(stated) @ error) <= _CHI2_95_OF_3)
+        inside.append(float(error @ np.linalg.pinv(stated) @ error) <= CHI2_95_OF_3)
         spread = math.sqrt(float(np.trace(stated)))
         ratios.append(float(np.linalg.norm(error)) / spread if spread > 0 else math.inf)
     return Calibration(float(np.mean(inside)), float(np.median(ratios)))

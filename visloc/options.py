@@ -42,7 +42,8 @@ class Inference(StrEnum):
 class Fusion(StrEnum):
     """How similarities under several global descriptors become one ranking.
 
-    Section 3.2 of Humenberger et al. 2020; ``visloc.retrieval.fusion`` has the formulas.
+    Section 4.3 and appendix B of Humenberger et al. 2020; the formulas are in
+    ``visloc.retrieval.fusion``.
     """
 
     GHARM = "gharm"  # generalized harmonic mean
@@ -53,6 +54,7 @@ class Fusion(StrEnum):
     MEAN_AND_POWER = "mean_and_power"
     MIN_AND_MAX = "min_and_max"
     MEAN_AND_MIN = "mean_and_min"
+    VILLENA_ROMAN = "villena_roman"
     HARMONIC = "harmonic"
     ROUND_ROBIN = "round_robin"
 
@@ -63,6 +65,13 @@ class Matcher(StrEnum):
     MUTUAL = "mutual"  # mutual nearest neighbours
     RATIO = "ratio"  # those of them that are clearly nearer than the second nearest
     LIGHTGLUE = "lightglue"  # the best photos again, by a network made for the local features
+
+
+class Fallback(StrEnum):
+    """What a photo gets that is refused."""
+
+    NONE = "none"
+    COARSE = "coarse"  # a pose told by retrieval alone, with a wide spread; never "localized"
 
 
 class Solver(StrEnum):
@@ -135,6 +144,8 @@ PRESETS: Mapping[str, RegistrationPreset] = {
     "config2": RegistrationPreset(max_error_px=20.0, min_inliers=4, min_inlier_ratio=0.05),
 }
 
+
+DEFAULT_FUSION_PARAMETER = 0.5  # kapture's; the paper names none
 
 _PRESETS_VALUE, _MAPS_VALUE = "the preset's", "the map's"
 
@@ -222,9 +233,23 @@ class LocalizeOptions:
         details="Descriptors without a weight are left out.",
         hash=False,  # a dict
     )
+    fusion_parameter: float = _option(
+        DEFAULT_FUSION_PARAMETER,
+        "gamma of gharm; beta, at most 1, of the fusions that mix two operators",
+        0.0,
+        100.0,
+        details="Beta is the share of the operator that is named first, and of the quotient in "
+        "villena_roman. Other fusions ignore it.",
+    )
     matcher: Matcher = _option(Matcher.MUTUAL, "how keypoints are matched")
     solver: Solver = _option(Solver.PYCOLMAP, "pose solver")
     seed: int = _option(0, "seed of RANSAC", 0, 2**31 - 1)
+    fallback: Fallback = _option(
+        Fallback.NONE,
+        "what a refused photo gets beside the reason",
+        details="coarse: the pose that the most similar mapping photos suggest, with its spread, "
+        "as an answer of status coarse. Only for a photo on its own, in one map.",
+    )
 
     def __post_init__(self) -> None:
         if self.preset not in PRESETS:

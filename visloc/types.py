@@ -119,6 +119,14 @@ class PoseSource(StrEnum):
     NEAREST = "nearest"  # the nearest instant
 
 
+class CoarseMethod(StrEnum):
+    """How the poses of retrieved photos approximate that of the query."""
+
+    EWB = "ewb"  # equal weighted barycentre
+    BDI = "bdi"  # barycentric descriptor interpolation
+    CSI = "csi"  # weighted by cosine similarity
+
+
 class Uncertainty(StrEnum):
     """What a covariance covers."""
 
@@ -319,6 +327,26 @@ class Candidate:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class CoarsePose:
+    """Where retrieved photos say that a photo was taken; no keypoint confirms it.
+
+    Attributes:
+        cam_from_world: the pose.
+        covariance: (6, 6) float64 of rotation (rad) then translation, for R <- Exp(w) R and
+            t <- t + dt of ``cam_from_world``: an ellipsoid of 95 % holds for photos of this map.
+        position_std: (3,) standard deviations of the camera centre along the world's axes.
+        orientation_std: (3,) standard deviations of w (rad), about the camera's x, y, z.
+        method: how the poses of the retrieved photos were put together.
+    """
+
+    cam_from_world: Pose
+    covariance: NDArray[np.float64]
+    position_std: NDArray[np.float64]
+    orientation_std: NDArray[np.float64]
+    method: CoarseMethod
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class NotLocalized:
     """The map was searched and gave no pose that can be trusted.
 
@@ -328,6 +356,7 @@ class NotLocalized:
         reason: why, as a stable word.
         message: why, for a person.
         candidates: the places of an ambiguous photo that have a pose; () otherwise.
+        coarse: a pose told by retrieval alone, if the query asked for one.
     """
 
     evidence: Evidence
@@ -335,6 +364,7 @@ class NotLocalized:
     reason: Reason
     message: str
     candidates: tuple[Candidate, ...] = ()
+    coarse: CoarsePose | None = None
 
 
 Answer = Localized | NotLocalized
@@ -416,6 +446,8 @@ class InstantAnswer:
         seconds: wall time by stage, of all images together.
         scores: (k,) float32, how much each keypoint of the images speaks for the pose
             (``visloc.localization.rivals.score``); empty when that is not known. Never sent.
+        coarse: of a photo on its own that asked for it, the pose that retrieval alone tells;
+            answers state it only when ``pose`` is None.
     """
 
     timestamp: int | None
@@ -424,6 +456,7 @@ class InstantAnswer:
     refusal: Refusal | None
     seconds: Mapping[str, float]
     scores: NDArray[np.float32] = field(default_factory=lambda: np.empty(0, np.float32))
+    coarse: CoarsePose | None = None
 
     @property
     def num_correspondences(self) -> int:

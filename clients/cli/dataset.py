@@ -112,7 +112,8 @@ def localize_batch(
     and skipped; if that was the server's fault, the same command sends it again.
 
     All modes except single fill photos that have no measured pose. Their status is filled, source
-    says how, and their poses are in poses_filled.txt. poses.txt has measured poses only.
+    says how, and their poses are in poses_filled.txt. poses.txt has measured poses only. With
+    --option fallback=coarse, refused photos that nothing fills are in poses_coarse.txt.
 
     Exits with 0 when every photo has its line, 1 on an error, 130 when stopped.
     """

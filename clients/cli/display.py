@@ -16,7 +16,7 @@ from visloc.types import Uncertainty
 from visloc_api.words.answers import Candidate
 from visloc_api.words.geopose import GeoPose
 from visloc_api.words.maps import MapInfo
-from visloc_api.words.poses import PoseEstimate
+from visloc_api.words.poses import CoarsePose, PoseEstimate
 
 _NUM_RETRIEVED_SHOWN = 3
 _NUM_FAILED_SHOWN = 5
@@ -56,6 +56,9 @@ def print_result(console: Console, result: LocalizeResult, unit: str) -> None:
         print_line(console, "gave up at", f"{result.refusal.stage} ({result.refusal.reason})")
         print_line(console, "map", f"{result.map.id}@{result.map.version}")
         _print_candidates(console, result.refusal.candidates)
+    if result.coarse is not None:
+        print_line(console, "coarse", "told by retrieval alone; nothing confirms it", "bold yellow")
+        _print_place(console, result.coarse, unit)
     if result.tile is not None:
         print_line(console, "tile", result.tile)
     print_line(
@@ -124,6 +127,8 @@ def print_batch(console: Console, counts: Mapping[str, int], num_photos: int, fi
     if fills:
         sources = [f"{counts[name]} {words}" for name, words in _FILLED.items() if counts[name]]
         parts.append(f"{counts['filled']} filled" + (f" ({', '.join(sources)})" if sources else ""))
+    if counts["coarse"]:
+        parts.append(f"{counts['coarse']} with a coarse pose only")
     parts += [f"{counts['not_localized']} not localized", f"{counts['error']} without an answer"]
     console.print(", ".join(parts), highlight=False)
 
@@ -150,7 +155,7 @@ def _on_earth(place: GeoPose) -> str:
     return f"{place.latitude:.8f}, {place.longitude:.8f}, {place.height:.3f} m above the ellipsoid"
 
 
-def _print_pose(console: Console, pose: PoseEstimate, unit: str) -> None:
+def _print_place(console: Console, pose: PoseEstimate | CoarsePose, unit: str) -> None:
     print_line(
         console,
         "position",
@@ -162,6 +167,10 @@ def _print_pose(console: Console, pose: PoseEstimate, unit: str) -> None:
         f"{_numbers(pose.orientation, 6)} (w x y z, world_from_cam), "
         f"std {_numbers(pose.orientation_std_deg, 3)} degrees",
     )
+
+
+def _print_pose(console: Console, pose: PoseEstimate, unit: str) -> None:
+    _print_place(console, pose, unit)
     print_line(console, "uncertainty", _UNCERTAINTY.get(pose.uncertainty, pose.uncertainty))
     if pose.probability is not None:
         print_line(console, "probability", f"{pose.probability:.3f} that the pose is right")

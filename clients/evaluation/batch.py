@@ -70,6 +70,11 @@ class Batch:
         return self.output / "poses_filled.txt"
 
     @property
+    def poses_coarse(self) -> Path:
+        """The poses that retrieval alone told, apart for the same reason."""
+        return self.output / "poses_coarse.txt"
+
+    @property
     def description(self) -> Path:
         """The map, the photos and the options of the run."""
         return self.output / "run.json"
@@ -87,7 +92,8 @@ def open_batch(batch: Batch, *, restart: bool) -> set[str]:
     """
     batch.output.mkdir(parents=True, exist_ok=True)
     if restart:
-        for path in (batch.results, batch.poses, batch.poses_filled, batch.description):
+        poses = (batch.poses, batch.poses_filled, batch.poses_coarse)
+        for path in (batch.results, *poses, batch.description):
             path.unlink(missing_ok=True)
     described = {
         "format": _FORMAT,
@@ -134,11 +140,11 @@ def finish_batch(batch: Batch, arrangement: Arrangement) -> Counter[str]:
     """Sort ``results.jsonl`` as the dataset, fill poses, and write them.
 
     The newest result of a photo is kept. ``poses_filled.txt`` is written in the modes that fill,
-    and in gp3p when any pose was filled.
+    and in gp3p when any pose was filled; ``poses_coarse.txt`` when a photo has no better one.
 
     Returns:
-        How many photos are localized, filled, not_localized and error, and how many were filled
-        from each source.
+        How many photos are localized, filled, coarse, not_localized and error, and how many were
+        filled from each source.
     """
     by_name = {result.name: result for result in read_results(batch.results)}
     ordered = [by_name[query.name] for query in arrangement.photos]
@@ -154,6 +160,11 @@ def finish_batch(batch: Batch, arrangement: Arrangement) -> Counter[str]:
         write_poses(batch.poses_filled, ((name, estimate_of(p)) for name, p in filled.items()))
     else:
         batch.poses_filled.unlink(missing_ok=True)
+    coarse = [(r.name, r.coarse) for r in ordered if r.coarse is not None and r.name not in filled]
+    if coarse:
+        write_poses(batch.poses_coarse, coarse)
+    else:
+        batch.poses_coarse.unlink(missing_ok=True)
     statuses = ("filled" if r.name in filled else r.status for r in ordered)
     return Counter(statuses) + Counter(pose.source.value for pose in filled.values())
 

@@ -13,13 +13,15 @@ from urllib.parse import quote
 
 from clients.evaluation.filling import pose_as_json, uncertainty_of
 from clients.evaluation.run import Outcome
-from clients.wire.answers import parse_pose
+from clients.wire.answers import parse_coarse, parse_pose
 from visloc.errors import InvalidInput, refuse
 from visloc.sequences.filling import TracedPose
 from visloc.types import PoseSource
-from visloc_api.words.poses import PoseEstimate
+from visloc_api.words.poses import CoarsePose, PoseEstimate
 
 _LOCALIZED, _NOT_LOCALIZED, _ERROR, _FILLED = "localized", "not_localized", "error", "filled"
+_COARSE = "coarse"
+_STATUSES = (_LOCALIZED, _COARSE, _NOT_LOCALIZED, _ERROR)
 # Errors that say nothing about the photo: it may be answered when it is sent again.
 _PASSING_CODES = ("server.internal", "server.timeout")
 _PASSING_KINDS = ("Unavailable", "Overloaded")
@@ -30,10 +32,12 @@ class StoredResult:
     """One line of ``results.jsonl``.
 
     Attributes:
-        status: localized, not_localized or error; for a filled photo, its status before filling.
+        status: localized, coarse, not_localized or error; for a filled photo, its status before
+            filling.
         pose: when localized.
         filled: the pose from other photos, when the line has one.
         is_final: False for errors of the server: the photo is sent again.
+        coarse: the pose that retrieval alone told.
         offset: of the line in the file, bytes.
         length: of the line with its end, bytes.
     """
@@ -44,6 +48,7 @@ class StoredResult:
     num_inliers: int
     filled: TracedPose | None
     is_final: bool
+    coarse: CoarsePose | None
     offset: int
     length: int
 
@@ -137,7 +142,7 @@ def copy_lines(
         write_whole(target, lines())
 
 
-def write_poses(path: Path, poses: Iterable[tuple[str, PoseEstimate]]) -> None:
+def write_poses(path: Path, poses: Iterable[tuple[str, PoseEstimate | CoarsePose]]) -> None:
     """Write ``name qw qx qy qz tx ty tz`` lines of ``cam_from_world``, every digit as received.
 
     Readers of this format split at blanks, so blanks in a name, and ``%``, are percent-encoded:
@@ -172,7 +177,7 @@ def check_can_be_written(paths: Sequence[Path]) -> None:
 
 def _parse_line(
     line: bytes,
-) -> tuple[str, str, PoseEstimate | None, int, TracedPose | None, bool]:
+) -> tuple[str, str, PoseEstimate | None, int, TracedPose | None, bool, CoarsePose | None]:
     entry = json.loads(line)
     name, status = entry["name"], entry["status"]
     filled = None
@@ -180,7 +185,7 @@ def _parse_line(
         status, other = _before_filling(entry), parse_pose(entry["pose"])
         source, uncertainty = PoseSource(entry["source"]), uncertainty_of(other)
         filled = TracedPose(other.cam_from_world, other.covariance, source, uncertainty)
-    if not isinstance(name, str) or status not in (_LOCALIZED, _NOT_LOCALIZED, _ERROR):
+    if not isinstance(name, str) or status not in _STATUSES:
         raise ValueError(f"name {name!r}, status {status!r}")
     pose, num_inliers = None, 0
     if status == _LOCALIZED:
@@ -188,11 +193,14 @@ def _parse_line(
     is_final = status != _ERROR or not (
         entry["error"]["code"] in _PASSING_CODES or entry["error"]["kind"] in _PASSING_KINDS
     )
-    return name, status, pose, num_inliers, filled, is_final
+    coarse = parse_coarse(entry["coarse"]) if status == _COARSE else None
+    return name, status, pose, num_inliers, filled, is_final, coarse
 
 
 def _before_filling(entry: Mapping[str, Any]) -> str:
-    return _ERROR if "error" in entry else _NOT_LOCALIZED
+    if "error" in entry:
+        return _ERROR
+    return _NOT_LOCALIZED if entry.get("coarse") is None else _COARSE
 
 
 def _refilled(line: bytes, pose: TracedPose | None) -> bytes:
@@ -213,7 +221,7 @@ def _fill(entry: dict[str, Any], pose: TracedPose) -> None:
     entry["pose"] = pose_as_json(pose)
 
 
-def _pose_line(name: str, pose: PoseEstimate) -> str:
+def _pose_line(name: str, pose: PoseEstimate | CoarsePose) -> str:
     numbers = (repr(value) for value in (*pose.rotation_wxyz, *pose.translation))
     encoded = re.sub(r"[\s%]", lambda found: quote(found[0]), name)
     return f"{encoded} {' '.join(numbers)}\n"

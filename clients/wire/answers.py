@@ -12,7 +12,7 @@ from clients.wire.requests import JsonObject
 from visloc.errors import InvalidInput, VislocError
 from visloc_api.words.answers import ImageAnswer, InstantAnswer, LocalizeResponse
 from visloc_api.words.maps import ListMapsResponse, MapInfo
-from visloc_api.words.poses import PoseEstimate
+from visloc_api.words.poses import CoarsePose, PoseEstimate
 from visloc_api.words.status import Health
 
 _P = ParamSpec("_P")
@@ -93,6 +93,11 @@ def parse_result(raw: JsonObject) -> LocalizeResult:
 def parse_pose(raw: JsonObject) -> PoseEstimate:
     """Parse a PoseEstimate."""
     return PoseEstimate.model_validate(raw)
+
+
+def parse_coarse(raw: JsonObject) -> CoarsePose:
+    """Parse a CoarsePose."""
+    return CoarsePose.model_validate(raw)
 
 
 def parse_instant(raw: JsonObject) -> InstantResult:

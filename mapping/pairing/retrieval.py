@@ -11,6 +11,7 @@ from mapping.pairing.ranking import Candidates, best_of_rows, unite
 from mapping.pairing.scene import Pairs, Scene
 from mapping.pairing.settings import PairSettings
 from visloc.errors import refuse
+from visloc.options import DEFAULT_FUSION_PARAMETER
 from visloc.retrieval.fusion import equal_weights, gharm
 
 # Similarities held at a time, per descriptor: 32 MiB in float64.
@@ -45,6 +46,7 @@ def _ranked_blocks(tables: list[NDArray[np.float32]], top_k: int) -> Iterator[Ca
         cosines = np.stack([(rows[photos] @ rows.T).ravel() for rows in tables])
         # Unit vectors in float32 can give 1 + 1e-7.
         cosines = np.clip(cosines.astype(np.float64), -1.0, 1.0)
-        scores = gharm(cosines, equal_weights(len(tables))).reshape(len(photos), -1)
+        scores = gharm(cosines, equal_weights(len(tables)), DEFAULT_FUSION_PARAMETER)
+        scores = scores.reshape(len(photos), -1)
         scores[np.arange(len(photos)), photos] = -np.inf  # a photo is no pair with itself
         yield best_of_rows(photos, scores, top_k)

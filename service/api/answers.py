@@ -29,7 +29,7 @@ from visloc_api.words.answers import (
     RetrievedImage,
 )
 from visloc_api.words.geopose import GeoAngles, GeoPose, GeoPoseYpr, GeoPosition, GeoQuaternion
-from visloc_api.words.poses import PoseEstimate, RigPose
+from visloc_api.words.poses import CoarsePose, PoseEstimate, RigPose
 
 
 def localize_response(found: Localization, request_id: str) -> LocalizeResponse:
@@ -39,9 +39,10 @@ def localize_response(found: Localization, request_id: str) -> LocalizeResponse:
     assert evidence is not None  # a photo that cannot be used is an error
     cam_from_world = None if pose is None else pose.rig_from_world  # a rig of one camera
     geopose, geopose_ypr = geoposes_to_words(cam_from_world, found.geodetic, ypr=found.ypr)
+    coarse = found.answer.coarse if pose is None else None
     return LocalizeResponse(
         request_id=request_id,
-        status="not_localized" if pose is None else "localized",
+        status="localized" if pose is not None else "not_localized" if coarse is None else "coarse",
         pose=None if pose is None else _pose_estimate(pose),
         refusal=None if refusal is None else _refusal(refusal),
         keypoints=evidence.num_keypoints,
@@ -57,6 +58,7 @@ def localize_response(found: Localization, request_id: str) -> LocalizeResponse:
         geopose_ypr=geopose_ypr,
         debug=None if found.debug is None else Debug.model_validate(found.debug),
         tile=found.tile,
+        coarse=None if coarse is None else _coarse_pose(coarse),
     )
 
 
@@ -114,6 +116,19 @@ def _candidate(found: visloc.types.Candidate) -> Candidate:
 
 def _pose_estimate(pose: visloc.types.RigPose) -> PoseEstimate:
     return PoseEstimate.model_validate({"cam_from_world": pose.rig_from_world, **_uncertain(pose)})
+
+
+def _coarse_pose(coarse: visloc.types.CoarsePose) -> CoarsePose:
+    pose = coarse.cam_from_world
+    return CoarsePose(
+        cam_from_world=pose,
+        position=pose.center,
+        orientation=pose.inverse().rotation_wxyz,
+        covariance=coarse.covariance,
+        position_std=coarse.position_std,
+        orientation_std_deg=np.degrees(coarse.orientation_std),
+        method=coarse.method,
+    )
 
 
 def _rig_pose(pose: visloc.types.RigPose) -> RigPose:

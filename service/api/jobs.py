@@ -15,7 +15,7 @@ from service.values import (
     photo_job,
 )
 from visloc.errors import inside, refuse
-from visloc.options import MAX_MAPS
+from visloc.options import MAX_MAPS, Fallback, LocalizeOptions
 from visloc.sequences.filling import DEFAULT_MAX_GAP_S, TimeUnit
 from visloc_api.words.features import query_to_core
 from visloc_api.words.photo import LocalizeRequest
@@ -110,7 +110,7 @@ def rig_job_of(request: LocalizeRigRequest, files: Mapping[str, bytes] = NO_FILE
         rig,
         images,
         timestamp,
-        request.options.to_core(),
+        _options_without_fallback(request),
         priors_to_core(request.priors),
         ypr=bool(request.ypr),
     )
@@ -128,10 +128,22 @@ def sequence_job_of(start: SequenceStart) -> SequenceJob:
         rig=None if start.rig is None else _rig(start.rig),
         time_unit=TimeUnit(start.time_unit) if start.time_unit else None,
         max_gap_s=DEFAULT_MAX_GAP_S if start.max_gap_s is None else start.max_gap_s,
-        options=start.options.to_core(),
+        options=_options_without_fallback(start),
         priors=priors_to_core(start.priors),
         ypr=bool(start.ypr),
     )
+
+
+def _options_without_fallback(request: LocalizeRigRequest | SequenceStart) -> LocalizeOptions:
+    options = request.options.to_core()
+    if options.fallback is not Fallback.NONE:
+        raise refuse(
+            "options.fallback",
+            field="options.fallback",
+            expected=f"{Fallback.NONE} for a rig or a sequence",
+            got=options.fallback,
+        )
+    return options
 
 
 def instant_job_of(instant: Instant, parts: Parts, *, has_rig: bool) -> InstantJob:

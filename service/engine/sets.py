@@ -22,7 +22,7 @@ from service.engine.instant_tasks import localize_in
 from service.engine.set_photos import SetPhotos, Slots
 from service.telemetry.metrics import Metrics
 from service.values import ImageJob, Localization, MapFolder, Query, Rig, RigJob, Where
-from service.workers.judging import agree, judged
+from service.workers.judging import agree, judged, without_coarse
 from service.workers.pool import Workers
 from visloc.archive import SetOutline, TileRecord
 from visloc.archive.places import anchor_rms
@@ -192,6 +192,8 @@ class SetSearch:
         refusal = left_open(outline, row, places, elsewhere, choice.first)
         if refusal is not None:
             answer = replace(answer, answer=replace(answer.answer, pose=None, refusal=refusal))
+        if np.count_nonzero(choice.allowed) > 1:  # also where one of them was searched
+            answer = without_coarse(answer)
         return row, answer
 
     async def _asked(

@@ -31,8 +31,11 @@ def judged(found: Sequence[Localization], priors: Priors = NO_PRIORS) -> tuple[i
             poses, by itself and as a tile, the first counts.
 
     Returns:
-        The row and the answer. A refusal carries the evidence of the place with the most inliers.
+        The row and the answer. A refusal carries the evidence of the place with the most inliers,
+        and no coarse pose if there are several: retrieval does not tell which place it is.
     """
+    if len(found) > 1:
+        found = [without_coarse(each) for each in found]
     measured: set[str] = set()
     rows = []
     for row, each in enumerate(found):
@@ -51,6 +54,11 @@ def judged(found: Sequence[Localization], priors: Priors = NO_PRIORS) -> tuple[i
     row = max(rows, key=lambda row: found[row].answer.num_inliers)
     refused = replace(found[row].answer, pose=None, refusal=verdict)
     return row, replace(found[row], answer=refused)
+
+
+def without_coarse(found: Localization) -> Localization:
+    """Leave out the pose that retrieval alone tells."""
+    return replace(found, answer=replace(found.answer, coarse=None))
 
 
 def agree(a: Localization, b: Localization) -> bool:

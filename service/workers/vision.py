@@ -131,6 +131,9 @@ class Vision:
                 seen, (row, best, solved) = turned, again
             else:
                 best = _with_seconds(best, {"turns": perf_counter() - began})
+                if again is not None:  # its retrieved photos are still held as the photo is
+                    coarse = again[1].answer.coarse
+                    best = replace(best, answer=replace(best.answer, coarse=coarse))
         look = seen[row].look
         if not job.debug or look is None or not isinstance(decoded.query, Photo):
             return best

@@ -175,6 +175,7 @@ class CannedService:
             "geopose_ypr": None,
             "debug": DEBUG if asked.get("debug") and self.draws else None,
             "tile": None,
+            "coarse": None,
         }
 
     def localize_instant(

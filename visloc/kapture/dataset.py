@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Protocol
 
 from visloc.geometry import Camera, PixelOrigin, Pose
+from visloc.kapture.other_sensors import OtherRecords
 
 UNKNOWN_CAMERA = "UNKNOWN_CAMERA"
 
@@ -112,6 +113,8 @@ class Dataset:
         gnss: sorted by (timestamp, sensor_id).
         notes: bad rows that were tolerated, one sentence each, with file and count.
         files: where photos and depth maps lie, if not in ``sensors/records_data``.
+        other_records: of sensors that nothing here uses, by a name in
+            ``visloc.kapture.other_sensors.OTHER_FILES``.
     """
 
     root: Path
@@ -123,6 +126,7 @@ class Dataset:
     gnss: tuple[GnssRecord, ...]
     notes: tuple[str, ...] = ()
     files: RecordFiles | None = None
+    other_records: Mapping[str, OtherRecords] = field(default_factory=dict)
     _rigs_of_sensor: Mapping[str, list[str]] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -161,7 +165,14 @@ class Dataset:
         """Return a dataset that only finds files, small enough to send to other processes."""
         files = None if self.files is None else self.files.without_listing()
         return replace(
-            self, trajectories={}, images=(), depth_maps=(), gnss=(), notes=(), files=files
+            self,
+            trajectories={},
+            images=(),
+            depth_maps=(),
+            gnss=(),
+            notes=(),
+            files=files,
+            other_records={},
         )
 
     def with_pixels_from(self, origin: PixelOrigin) -> Dataset:

@@ -19,6 +19,7 @@ from visloc.kapture.dataset import (
     RecordFiles,
     Sensor,
 )
+from visloc.kapture.other_sensors import read_other_records
 from visloc.kapture.rigs import unroll_rigs
 from visloc.kapture.table import Table
 
@@ -26,7 +27,7 @@ _NEWEST_VERSION = (1, 1)
 
 
 def read_dataset(root: Path, files: RecordFiles | None = None) -> Dataset:
-    """Read sensors, rigs, trajectories and the camera, depth and GNSS records of a dataset.
+    """Read sensors, rigs, trajectories and records of a dataset; lidar records are not read.
 
     Only ``sensors/sensors.txt`` must exist.
 
@@ -45,7 +46,9 @@ def read_dataset(root: Path, files: RecordFiles | None = None) -> Dataset:
     images = _read_files(root, "records_camera.txt", "camera", sensors, notes, files)
     depth_maps = _read_files(root, "records_depth.txt", "depth", sensors, notes, files)
     gnss = _read_gnss(root, sensors, notes)
-    return Dataset(root, sensors, rigs, trajectories, images, depth_maps, gnss, tuple(notes), files)
+    records = images, depth_maps, gnss
+    other = read_other_records(root)
+    return Dataset(root, sensors, rigs, trajectories, *records, tuple(notes), files, other)
 
 
 def _read_sensors(root: Path, notes: list[str]) -> dict[str, Sensor]:

@@ -10,6 +10,7 @@ from pathlib import Path
 from visloc.errors import refuse
 from visloc.geometry import Pose
 from visloc.kapture.dataset import Dataset
+from visloc.kapture.other_sensors import OTHER_FILES
 from visloc.kapture.text import is_field, relative_path
 
 VERSION_LINE = "# kapture format: 1.1"
@@ -102,6 +103,8 @@ def _tables(dataset: Dataset) -> Iterator[tuple[str, Sequence[str], list[list[st
             for r in dataset.gnss
         ],
     )
+    for name, other in dataset.other_records.items():
+        yield name, OTHER_FILES[name], [list(row) for row in other]
     yield (
         "sensors.txt",
         ("sensor_id", "name", "sensor_type", "[sensor_params]+"),

@@ -21,6 +21,7 @@ from visloc.features.local.readymade import is_ready_made
 from visloc.features.networks.lightglue.load import make_lightglue
 from visloc.geometry import Camera, Pose
 from visloc.images import Photo
+from visloc.localization.coarse import CoarsePoses
 from visloc.localization.constraints import Constraints, MapGeometry
 from visloc.localization.evidence import Shown
 from visloc.localization.feature_cache import FeatureCache, find_features
@@ -49,7 +50,7 @@ from visloc.matching.correspondences import (
     propose_landmarks,
 )
 from visloc.matching.products import round_descriptors, start_threads
-from visloc.options import LocalizeOptions, Matcher, ReadAs
+from visloc.options import Fallback, LocalizeOptions, Matcher, ReadAs
 from visloc.priors import NO_PRIORS, Priors
 from visloc.retrieval.excluded import excluded_photos
 from visloc.retrieval.fusion import LateFusion, chosen_fusion
@@ -134,6 +135,7 @@ class Localizer:
                 check_fingerprint(record.fingerprint, descriptor.fingerprint, opened.ref)
                 self._descriptors[name] = descriptor
         self.geometry = MapGeometry(opened)
+        self._coarse = CoarsePoses(self.geometry)
         self.turns = (
             None if extractor is None else TurnFinder(self.geometry, extractor, self._descriptors)
         )
@@ -209,7 +211,8 @@ class Localizer:
             return answer
         look = self.look(photo, camera, options, priors, cache, turned)
         again = self.solve_look(look, options, priors)[0]
-        return again if isinstance(again, Localized) else answer
+        # If this is refused too, its retrieved photos are still held as the photo is.
+        return again if isinstance(again, Localized) else replace(answer, coarse=again.coarse)
 
     def localize_features(
         self,
@@ -329,7 +332,7 @@ class Localizer:
         if refusal is not None or pose is None or pose.photo_covariance is None:
             assert refusal is not None  # without a pose there is a reason
             told = (refusal.stage, refusal.reason, refusal.message, refusal.candidates)
-            return NotLocalized(evidence, *told), inliers
+            return NotLocalized(evidence, *told, coarse=answer.coarse), inliers
         localized = Localized(
             evidence=evidence,
             cam_from_world=pose.rig_from_world,
@@ -377,6 +380,12 @@ class Localizer:
             why = "the map has no photo in the area that the priors allow"
             return Look.nothing(evidence, Refusal("retrieval", Reason.NO_PHOTO_NEAR, why))
         evidence = replace(evidence, retrieved=tuple(self._describe_retrieved(retrieved)))
+        coarse = None
+        if options.fallback is Fallback.COARSE:
+            with timed(seconds, "coarse"):
+                coarse = self._coarse.approximate(
+                    query, retrieved.images, fusion, evidence, constraints
+                )
         with timed(seconds, "matching"):
             shown = Shown(local.keypoints, round_descriptors(local.descriptors))
             ratio = CLEAR_RATIO if options.matcher is Matcher.RATIO else None
@@ -393,6 +402,7 @@ class Localizer:
             shown=shown,
             proposed=Proposed(shown, pairs, points, retrieved.images, ratio),
             reduced=features.reduced,
+            coarse=coarse,
         )
 
     def _match_photos(

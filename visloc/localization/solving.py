@@ -25,6 +25,7 @@ from visloc.priors import Priors
 from visloc.timing import timed
 from visloc.types import (
     CameraSource,
+    CoarsePose,
     Evidence,
     ImageAnswer,
     InstantAnswer,
@@ -70,6 +71,7 @@ class Look:
         shown: all that was found in the image; None when a pose shall not be compared with it.
         proposed: all pairs that the searched photos proposed; None when they were not kept.
         reduced: how many stored pixels each side of a pixel spans.
+        coarse: the pose that retrieval alone tells, if the query asked for one.
     """
 
     evidence: Evidence
@@ -80,6 +82,7 @@ class Look:
     shown: Shown | None = None
     proposed: Proposed | None = None
     reduced: float = 1.0
+    coarse: CoarsePose | None = None
 
     @staticmethod
     def nothing(evidence: Evidence, refusal: Refusal) -> Look:
@@ -197,7 +200,8 @@ def solve_instant(
     inliers = () if found is None else tuple(found.inliers)
     camera = None if refusal is not None or found is None else found.camera
     shown = with_inliers([_shown(image, camera) for image in images], inliers)
-    answer = InstantAnswer(timestamp, shown, pose, refusal, seconds, scores)
+    coarse = looks[0].coarse if len(looks) == 1 else None
+    answer = InstantAnswer(timestamp, shown, pose, refusal, seconds, scores, coarse)
     views = tuple(replace(view, camera=camera or view.camera) for view in problem.views)
     solved = Solved(answer, views, found if refusal is None else None, inliers)
     refusal = not_probable_enough(answer, options)

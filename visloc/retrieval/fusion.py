@@ -1,13 +1,15 @@
 """Late fusion: one score per mapping photo from its cosine similarities to the query.
 
 Section 4.3 and appendix B of Humenberger et al. 2020. An operator takes similarities (m, n), one
-row per global descriptor, and positive weights (m,) whose sum is 1, and gives fused scores (n,).
-Scores order the photos of one query. They are not cosines, except with a single descriptor.
+row per global descriptor, positive weights (m,) whose sum is 1, and the operator's parameter, and
+gives fused scores (n,). The parameter is the paper's gamma (generalized harmonic mean) or beta
+(mixtures of two operators, the share of the first); other operators have none. Scores order the
+photos of one query. They are not cosines, except with a single descriptor.
 
-Every operator is defined and finite for all cosines from -1 to 1, and no score falls when a
-similarity rises. Formulas that divide by similarities or take powers of them are undefined from 0
-on (generalized harmonic mean: from a negative value on). There the smallest similarity is the
-score, which is continuous.
+Every operator is defined and finite for all cosines from -1 to 1. With the default parameter, no
+score falls when a similarity rises. Formulas that divide by similarities or take powers of them are
+undefined from 0 on (generalized harmonic mean: from a negative value on). There the smallest
+similarity stands for the formula, which is continuous.
 """
 
 from __future__ import annotations
@@ -20,11 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.errors import refuse
-from visloc.options import Fusion, LocalizeOptions
+from visloc.options import DEFAULT_FUSION_PARAMETER, Fusion, LocalizeOptions
 
-FusionOperator = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
-
-GHARM_GAMMA = 0.5
+_Scores = NDArray[np.float64]
+FusionOperator = Callable[[_Scores, _Scores, float], _Scores]
+# Of an operator that has no parameter.
+_Plain = Callable[[_Scores, _Scores], _Scores]
 
 
 def equal_weights(count: int) -> NDArray[np.float64]:
@@ -36,30 +39,38 @@ def _of_several(operator: FusionOperator) -> FusionOperator:
     """Return a single descriptor's cosines unchanged, which formulas would round or rank."""
 
     @wraps(operator)
-    def fused(
-        similarities: NDArray[np.float64], weights: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def fused(similarities: _Scores, weights: _Scores, parameter: float) -> _Scores:
         if len(similarities) == 1:
             return np.asarray(similarities[0])
+        return operator(similarities, weights, parameter)
+
+    return fused
+
+
+def _without_parameter(operator: _Plain) -> FusionOperator:
+    @_of_several
+    def fused(similarities: _Scores, weights: _Scores, parameter: float) -> _Scores:
+        del parameter
         return operator(similarities, weights)
 
     return fused
 
 
 @_of_several
-def gharm(similarities: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Generalized harmonic mean, ``1 / mean(1 / (gamma + a_i s_i)) - gamma`` with gamma 0.5.
+def gharm(similarities: _Scores, weights: _Scores, gamma: float) -> _Scores:
+    """Generalized harmonic mean, ``1 / mean(1 / (gamma + a_i s_i)) - gamma``.
 
-    A low similarity under one descriptor pulls the score down more than in the arithmetic mean.
-    With equal weights the result lies within [-1/m, 1/m].
+    A low similarity under one descriptor pulls the score down more than in the arithmetic mean,
+    which the result tends to with a growing gamma. With equal weights and a gamma of 0.5 it lies
+    within [-1/m, 1/m].
     """
     # Divided by 1 / a: with equal weights that is by m, exactly.
-    shifted = GHARM_GAMMA + similarities / (1.0 / weights)[:, None]
+    shifted = gamma + similarities / (1.0 / weights)[:, None]
     lowest = shifted.min(axis=0)
-    # Beside 0.5 nothing positive is below 2**-54: one over it is finite.
     positive = np.where(lowest > 0, shifted, 1.0)
-    fused = len(shifted) / np.sum(1.0 / positive, axis=0)
-    return np.asarray(np.where(lowest > 0, fused, lowest) - GHARM_GAMMA)
+    with np.errstate(over="ignore"):  # one over infinity is what it tends to
+        fused = len(shifted) / np.sum(1.0 / positive, axis=0)
+    return np.asarray(np.where(lowest > 0, fused, lowest) - gamma)
 
 
 def mean(similarities: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -68,7 +79,6 @@ def mean(similarities: NDArray[np.float64], weights: NDArray[np.float64]) -> NDA
     return np.asarray(np.sum(weights[:, None] * similarities, axis=0))
 
 
-@_of_several
 def power(similarities: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
     """Weighted geometric mean, ``prod(s_i ** a_i)``."""
     lowest = similarities.min(axis=0)
@@ -93,7 +103,6 @@ def largest(
     return np.asarray(similarities.max(axis=0))
 
 
-@_of_several
 def harmonic(
     similarities: NDArray[np.float64], weights: NDArray[np.float64]
 ) -> NDArray[np.float64]:
@@ -109,14 +118,14 @@ def harmonic(
     return np.asarray(np.where(lowest > 0, fused, lowest) / len(similarities))
 
 
-@_of_several
 def round_robin(
-    similarities: NDArray[np.float64], weights: NDArray[np.float64]
+    similarities: NDArray[np.float64],
+    weights: NDArray[np.float64],  # noqa: ARG001 (of every operator)
 ) -> NDArray[np.float64]:
     """Take the first photo of every descriptor's ranking, then the second of each, and so on.
 
-    A photo that was taken is skipped. Photos of one round are ordered by their weighted mean, so
-    that the order of the descriptors does not matter. Weights have no other effect.
+    The descriptors take turns in their order, and a photo that was taken is skipped. Weights do
+    not matter.
 
     Returns:
         (n,) 1 / position. Photos with equal similarities share the first of their positions.
@@ -127,38 +136,59 @@ def round_robin(
     before = np.stack(
         [num - np.searchsorted(r, s, "right") for r, s in zip(rising, similarities, strict=True)]
     )
-    rounds = before.min(axis=0)
-    # Sorted, so that the last bit of the sum does not depend on the order of descriptors either.
-    means = np.sort(weights[:, None] * similarities, axis=0).sum(axis=0)
-    order = np.lexsort((-means, rounds))
+    turns = before.min(axis=0) * len(similarities) + before.argmin(axis=0)
+    order = np.argsort(turns, kind="stable")
     follows = np.ones(num, dtype=np.bool_)
-    follows[1:] = (np.diff(rounds[order]) != 0) | (np.diff(means[order]) != 0)
+    follows[1:] = np.diff(turns[order]) != 0
     scores = np.empty(num)
     scores[order] = 1.0 / np.maximum.accumulate(np.where(follows, np.arange(1, num + 1), 1))
     return scores
 
 
-def _half_and_half(one: FusionOperator, other: FusionOperator) -> FusionOperator:
-    def fused(
-        similarities: NDArray[np.float64], weights: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        return 0.5 * (one(similarities, weights) + other(similarities, weights))
+@_of_several
+def villena_roman(similarities: _Scores, weights: _Scores, beta: float) -> _Scores:
+    """``(1 - beta) max(s_i) + beta min(s_i)^2 / (max(s_i) + min(s_i))``; weights do not matter.
+
+    From 0 on, ``min(s_i)`` stands for the quotient, which has a pole there.
+    """
+    del weights
+    low, high = similarities.min(axis=0), similarities.max(axis=0)
+    a, b = (np.where(low > 0, each, 1.0) for each in (low, high))
+    # Not squared: what is tiny would become 0.
+    quotient = np.where(low > 0, a * (a / (b + a)), low)
+    return np.asarray((1.0 - beta) * high + beta * quotient)
+
+
+def _mixed(one: _Plain, other: _Plain) -> FusionOperator:
+    """``beta one + (1 - beta) other``."""
+
+    @_of_several
+    def fused(similarities: _Scores, weights: _Scores, beta: float) -> _Scores:
+        first, second = one(similarities, weights), other(similarities, weights)
+        return np.asarray(beta * first + (1.0 - beta) * second)
 
     return fused
 
 
 FUSION_OPERATORS: Mapping[Fusion, FusionOperator] = {
     Fusion.GHARM: gharm,
-    Fusion.MEAN: mean,
-    Fusion.POWER: power,
-    Fusion.MIN: smallest,
-    Fusion.MAX: largest,
-    Fusion.MEAN_AND_POWER: _half_and_half(mean, power),
-    Fusion.MIN_AND_MAX: _half_and_half(smallest, largest),
-    Fusion.MEAN_AND_MIN: _half_and_half(mean, smallest),
-    Fusion.HARMONIC: harmonic,
-    Fusion.ROUND_ROBIN: round_robin,
+    Fusion.MEAN: _without_parameter(mean),
+    Fusion.POWER: _without_parameter(power),
+    Fusion.MIN: _without_parameter(smallest),
+    Fusion.MAX: _without_parameter(largest),
+    Fusion.MEAN_AND_POWER: _mixed(mean, power),
+    Fusion.MIN_AND_MAX: _mixed(smallest, largest),
+    Fusion.MEAN_AND_MIN: _mixed(mean, smallest),
+    Fusion.VILLENA_ROMAN: villena_roman,
+    Fusion.HARMONIC: _without_parameter(harmonic),
+    Fusion.ROUND_ROBIN: _without_parameter(round_robin),
 }
+
+
+# Their parameter is a share.
+_MIXTURES = (
+    *(Fusion.MEAN_AND_POWER, Fusion.MIN_AND_MAX, Fusion.MEAN_AND_MIN, Fusion.VILLENA_ROMAN),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,10 +199,12 @@ class LateFusion:
         operator: a key of ``FUSION_OPERATORS``.
         weights: positive weight by global descriptor, of any sum; descriptors without a weight are
             ignored. None weighs all equally.
+        parameter: gamma or beta of the operator, where it has one.
     """
 
     operator: Fusion = Fusion.GHARM
     weights: Mapping[str, float] | None = None
+    parameter: float = DEFAULT_FUSION_PARAMETER
 
     def counted(self, names: Iterable[str]) -> tuple[str, ...]:
         """The global descriptors that are not ignored."""
@@ -186,7 +218,7 @@ class LateFusion:
             weights = np.array([self.weights[name] for name in names], dtype=np.float64)
             weights /= weights.sum()
         stacked = np.stack([similarities[name] for name in names])
-        return FUSION_OPERATORS[self.operator](stacked, weights)
+        return FUSION_OPERATORS[self.operator](stacked, weights, self.parameter)
 
 
 EQUAL_GHARM = LateFusion()
@@ -198,7 +230,8 @@ def chosen_fusion(
     """Return the fusion that a query's options ask for, or the map's default.
 
     Raises:
-        InvalidInput: ``options.fusion_weights`` for a name that is not in the map's ``names``.
+        InvalidInput: ``options.fusion_weights`` for a name that is not in the map's ``names``;
+            ``options.fusion_parameter`` for a share above 1.
     """
     known = tuple(names)
     for name in options.fusion_weights or ():
@@ -210,7 +243,16 @@ def chosen_fusion(
                 expected=f"weights of {', '.join(known)}",
                 got=name,
             )
+    operator = default.operator if options.fusion is None else options.fusion
+    if operator in _MIXTURES and options.fusion_parameter > 1.0:
+        raise refuse(
+            "options.fusion_parameter",
+            field="options.fusion_parameter",
+            expected=f"0 to 1 for the fusion {operator}",
+            got=options.fusion_parameter,
+        )
     return LateFusion(
-        default.operator if options.fusion is None else options.fusion,
+        operator,
         default.weights if options.fusion_weights is None else options.fusion_weights,
+        options.fusion_parameter,
     )

@@ -11,7 +11,7 @@ from visloc.errors import refuse
 from visloc.geometry import Pose, Similarity
 from visloc.pose.centre import moved_pose, position_covariance
 from visloc.priors import HeightBand, PosePrior, PositionPrior, Priors
-from visloc.types import InstantAnswer, RigPose
+from visloc.types import CoarsePose, InstantAnswer, RigPose
 
 
 def answer_in_set(answer: InstantAnswer, set_from_tile: Similarity, set_ref: str) -> InstantAnswer:
@@ -39,7 +39,8 @@ def answer_in_set(answer: InstantAnswer, set_from_tile: Similarity, set_ref: str
             for each in refusal.candidates
         )
         refusal = replace(refusal, candidates=candidates)
-    return replace(answer, images=images, pose=rig, refusal=refusal)
+    coarse = None if answer.coarse is None else _moved_coarse(answer.coarse, set_from_tile)
+    return replace(answer, images=images, pose=rig, refusal=refusal, coarse=coarse)
 
 
 def down_in_set(priors: Priors, down: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
@@ -115,6 +116,12 @@ def _moved_rig(rig: RigPose, set_from_tile: Similarity) -> RigPose:
         position_std=_position_std(rig.rig_from_world, rig.covariance, set_from_tile),
         photo_covariance=photo,
     )
+
+
+def _moved_coarse(coarse: CoarsePose, set_from_tile: Similarity) -> CoarsePose:
+    pose, covariance = moved_pose(coarse.cam_from_world, coarse.covariance, set_from_tile)
+    std = _position_std(coarse.cam_from_world, coarse.covariance, set_from_tile)
+    return replace(coarse, cam_from_world=pose, covariance=covariance, position_std=std)
 
 
 def _position_std(

@@ -89,9 +89,11 @@ class LocalizeOptions(_message.Message):
     EXTRACTION_FIELD_NUMBER: _builtins.int
     FUSION_FIELD_NUMBER: _builtins.int
     FUSION_WEIGHTS_FIELD_NUMBER: _builtins.int
+    FUSION_PARAMETER_FIELD_NUMBER: _builtins.int
     MATCHER_FIELD_NUMBER: _builtins.int
     SOLVER_FIELD_NUMBER: _builtins.int
     SEED_FIELD_NUMBER: _builtins.int
+    FALLBACK_FIELD_NUMBER: _builtins.int
     preset: _builtins.str
     """thresholds to start from"""
     top_k: _builtins.int
@@ -113,12 +115,16 @@ class LocalizeOptions(_message.Message):
     """effort to find features"""
     fusion: _builtins.str
     """How similarities under several global descriptors become one ranking."""
+    fusion_parameter: _builtins.float
+    """Gamma of gharm; beta, at most 1, of the fusions that mix two operators."""
     matcher: _builtins.str
     """of keypoints"""
     solver: _builtins.str
     """of the pose"""
     seed: _builtins.int
     """of RANSAC"""
+    fallback: _builtins.str
+    """What a refused photo on its own gets: none, or coarse, the pose that retrieval alone tells."""
     @_builtins.property
     def fusion_weights(self) -> _containers.ScalarMap[_builtins.str, _builtins.float]:
         """Weight by global descriptor; descriptors without a weight are not used. When empty, the map's
@@ -138,18 +144,24 @@ class LocalizeOptions(_message.Message):
         extraction: _builtins.str | None = ...,
         fusion: _builtins.str | None = ...,
         fusion_weights: _abc.Mapping[_builtins.str, _builtins.float] | None = ...,
+        fusion_parameter: _builtins.float | None = ...,
         matcher: _builtins.str | None = ...,
         solver: _builtins.str | None = ...,
         seed: _builtins.int | None = ...,
+        fallback: _builtins.str | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_extraction", b"_extraction", "_fusion", b"_fusion", "_matcher", b"_matcher", "_max_error_px", b"_max_error_px", "_min_inlier_ratio", b"_min_inlier_ratio", "_min_inliers", b"_min_inliers", "_min_probability", b"_min_probability", "_preset", b"_preset", "_read_as", b"_read_as", "_seed", b"_seed", "_solver", b"_solver", "_top_k", b"_top_k", "extraction", b"extraction", "fusion", b"fusion", "matcher", b"matcher", "max_error_px", b"max_error_px", "min_inlier_ratio", b"min_inlier_ratio", "min_inliers", b"min_inliers", "min_probability", b"min_probability", "preset", b"preset", "read_as", b"read_as", "seed", b"seed", "solver", b"solver", "top_k", b"top_k"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_extraction", b"_extraction", "_fallback", b"_fallback", "_fusion", b"_fusion", "_fusion_parameter", b"_fusion_parameter", "_matcher", b"_matcher", "_max_error_px", b"_max_error_px", "_min_inlier_ratio", b"_min_inlier_ratio", "_min_inliers", b"_min_inliers", "_min_probability", b"_min_probability", "_preset", b"_preset", "_read_as", b"_read_as", "_seed", b"_seed", "_solver", b"_solver", "_top_k", b"_top_k", "extraction", b"extraction", "fallback", b"fallback", "fusion", b"fusion", "fusion_parameter", b"fusion_parameter", "matcher", b"matcher", "max_error_px", b"max_error_px", "min_inlier_ratio", b"min_inlier_ratio", "min_inliers", b"min_inliers", "min_probability", b"min_probability", "preset", b"preset", "read_as", b"read_as", "seed", b"seed", "solver", b"solver", "top_k", b"top_k"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_extraction", b"_extraction", "_fusion", b"_fusion", "_matcher", b"_matcher", "_max_error_px", b"_max_error_px", "_min_inlier_ratio", b"_min_inlier_ratio", "_min_inliers", b"_min_inliers", "_min_probability", b"_min_probability", "_preset", b"_preset", "_read_as", b"_read_as", "_seed", b"_seed", "_solver", b"_solver", "_top_k", b"_top_k", "extraction", b"extraction", "fusion", b"fusion", "fusion_weights", b"fusion_weights", "matcher", b"matcher", "max_error_px", b"max_error_px", "min_inlier_ratio", b"min_inlier_ratio", "min_inliers", b"min_inliers", "min_probability", b"min_probability", "preset", b"preset", "read_as", b"read_as", "seed", b"seed", "solver", b"solver", "top_k", b"top_k"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_extraction", b"_extraction", "_fallback", b"_fallback", "_fusion", b"_fusion", "_fusion_parameter", b"_fusion_parameter", "_matcher", b"_matcher", "_max_error_px", b"_max_error_px", "_min_inlier_ratio", b"_min_inlier_ratio", "_min_inliers", b"_min_inliers", "_min_probability", b"_min_probability", "_preset", b"_preset", "_read_as", b"_read_as", "_seed", b"_seed", "_solver", b"_solver", "_top_k", b"_top_k", "extraction", b"extraction", "fallback", b"fallback", "fusion", b"fusion", "fusion_parameter", b"fusion_parameter", "fusion_weights", b"fusion_weights", "matcher", b"matcher", "max_error_px", b"max_error_px", "min_inlier_ratio", b"min_inlier_ratio", "min_inliers", b"min_inliers", "min_probability", b"min_probability", "preset", b"preset", "read_as", b"read_as", "seed", b"seed", "solver", b"solver", "top_k", b"top_k"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__extraction: _TypeAlias = _typing.Literal["extraction"]  # noqa: Y015
     _WhichOneofArgType__extraction: _TypeAlias = _typing.Literal["_extraction", b"_extraction"]  # noqa: Y015
+    _WhichOneofReturnType__fallback: _TypeAlias = _typing.Literal["fallback"]  # noqa: Y015
+    _WhichOneofArgType__fallback: _TypeAlias = _typing.Literal["_fallback", b"_fallback"]  # noqa: Y015
     _WhichOneofReturnType__fusion: _TypeAlias = _typing.Literal["fusion"]  # noqa: Y015
     _WhichOneofArgType__fusion: _TypeAlias = _typing.Literal["_fusion", b"_fusion"]  # noqa: Y015
+    _WhichOneofReturnType__fusion_parameter: _TypeAlias = _typing.Literal["fusion_parameter"]  # noqa: Y015
+    _WhichOneofArgType__fusion_parameter: _TypeAlias = _typing.Literal["_fusion_parameter", b"_fusion_parameter"]  # noqa: Y015
     _WhichOneofReturnType__matcher: _TypeAlias = _typing.Literal["matcher"]  # noqa: Y015
     _WhichOneofArgType__matcher: _TypeAlias = _typing.Literal["_matcher", b"_matcher"]  # noqa: Y015
     _WhichOneofReturnType__max_error_px: _TypeAlias = _typing.Literal["max_error_px"]  # noqa: Y015
@@ -173,7 +185,11 @@ class LocalizeOptions(_message.Message):
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__extraction) -> _WhichOneofReturnType__extraction | None: ...
     @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__fallback) -> _WhichOneofReturnType__fallback | None: ...
+    @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__fusion) -> _WhichOneofReturnType__fusion | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__fusion_parameter) -> _WhichOneofReturnType__fusion_parameter | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__matcher) -> _WhichOneofReturnType__matcher | None: ...
     @_typing.overload
@@ -1051,6 +1067,62 @@ class PoseEstimate(_message.Message):
 Global___PoseEstimate: _TypeAlias = PoseEstimate  # noqa: Y015
 
 @_typing.final
+class CoarsePose(_message.Message):
+    """Where the most similar mapping photos say that the photo was taken; nothing confirms it."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    CAM_FROM_WORLD_FIELD_NUMBER: _builtins.int
+    POSITION_FIELD_NUMBER: _builtins.int
+    ORIENTATION_FIELD_NUMBER: _builtins.int
+    COVARIANCE_FIELD_NUMBER: _builtins.int
+    POSITION_STD_FIELD_NUMBER: _builtins.int
+    ORIENTATION_STD_DEG_FIELD_NUMBER: _builtins.int
+    METHOD_FIELD_NUMBER: _builtins.int
+    method: _builtins.str
+    """bdi, ewb or csi: how the photos' poses were put together"""
+    @_builtins.property
+    def cam_from_world(self) -> Global___Transform: ...
+    @_builtins.property
+    def position(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """camera centre in the world"""
+
+    @_builtins.property
+    def orientation(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """rotation of world_from_cam as w, x, y, z"""
+
+    @_builtins.property
+    def covariance(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """as in PoseEstimate, learned from the map's own photos"""
+
+    @_builtins.property
+    def position_std(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """of the position, along the world's axes"""
+
+    @_builtins.property
+    def orientation_std_deg(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """about the camera's x, y, z axes, degrees"""
+
+    def __init__(
+        self,
+        *,
+        cam_from_world: Global___Transform | None = ...,
+        position: _abc.Iterable[_builtins.float] | None = ...,
+        orientation: _abc.Iterable[_builtins.float] | None = ...,
+        covariance: _abc.Iterable[_builtins.float] | None = ...,
+        position_std: _abc.Iterable[_builtins.float] | None = ...,
+        orientation_std_deg: _abc.Iterable[_builtins.float] | None = ...,
+        method: _builtins.str = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["cam_from_world", b"cam_from_world"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["cam_from_world", b"cam_from_world", "covariance", b"covariance", "method", b"method", "orientation", b"orientation", "orientation_std_deg", b"orientation_std_deg", "position", b"position", "position_std", b"position_std"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___CoarsePose: _TypeAlias = CoarsePose  # noqa: Y015
+
+@_typing.final
 class Candidate(_message.Message):
     """One of the two places between which an ambiguous query leaves the choice."""
 
@@ -1326,9 +1398,10 @@ class LocalizeResponse(_message.Message):
     GEOPOSE_YPR_FIELD_NUMBER: _builtins.int
     DEBUG_FIELD_NUMBER: _builtins.int
     TILE_FIELD_NUMBER: _builtins.int
+    COARSE_FIELD_NUMBER: _builtins.int
     request_id: _builtins.str
     status: _builtins.str
-    """localized or not_localized"""
+    """localized, coarse (not localized, but see coarse) or not_localized"""
     keypoints: _builtins.int
     correspondences: _builtins.int
     inliers: _builtins.int
@@ -1359,6 +1432,10 @@ class LocalizeResponse(_message.Message):
     def geopose_ypr(self) -> Global___GeoPoseYpr: ...
     @_builtins.property
     def debug(self) -> Global___Debug: ...
+    @_builtins.property
+    def coarse(self) -> Global___CoarsePose:
+        """of status coarse"""
+
     def __init__(
         self,
         *,
@@ -1379,11 +1456,14 @@ class LocalizeResponse(_message.Message):
         geopose_ypr: Global___GeoPoseYpr | None = ...,
         debug: Global___Debug | None = ...,
         tile: _builtins.str | None = ...,
+        coarse: Global___CoarsePose | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_debug", b"_debug", "_geopose", b"_geopose", "_geopose_ypr", b"_geopose_ypr", "_pose", b"_pose", "_refusal", b"_refusal", "_tile", b"_tile", "camera", b"camera", "debug", b"debug", "geopose", b"geopose", "geopose_ypr", b"geopose_ypr", "map", b"map", "orientation", b"orientation", "pose", b"pose", "refusal", b"refusal", "tile", b"tile"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_coarse", b"_coarse", "_debug", b"_debug", "_geopose", b"_geopose", "_geopose_ypr", b"_geopose_ypr", "_pose", b"_pose", "_refusal", b"_refusal", "_tile", b"_tile", "camera", b"camera", "coarse", b"coarse", "debug", b"debug", "geopose", b"geopose", "geopose_ypr", b"geopose_ypr", "map", b"map", "orientation", b"orientation", "pose", b"pose", "refusal", b"refusal", "tile", b"tile"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_debug", b"_debug", "_geopose", b"_geopose", "_geopose_ypr", b"_geopose_ypr", "_pose", b"_pose", "_refusal", b"_refusal", "_tile", b"_tile", "camera", b"camera", "correspondences", b"correspondences", "debug", b"debug", "geopose", b"geopose", "geopose_ypr", b"geopose_ypr", "inlier_ratio", b"inlier_ratio", "inliers", b"inliers", "keypoints", b"keypoints", "map", b"map", "orientation", b"orientation", "pose", b"pose", "refusal", b"refusal", "request_id", b"request_id", "retrieved", b"retrieved", "seconds", b"seconds", "status", b"status", "tile", b"tile"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_coarse", b"_coarse", "_debug", b"_debug", "_geopose", b"_geopose", "_geopose_ypr", b"_geopose_ypr", "_pose", b"_pose", "_refusal", b"_refusal", "_tile", b"_tile", "camera", b"camera", "coarse", b"coarse", "correspondences", b"correspondences", "debug", b"debug", "geopose", b"geopose", "geopose_ypr", b"geopose_ypr", "inlier_ratio", b"inlier_ratio", "inliers", b"inliers", "keypoints", b"keypoints", "map", b"map", "orientation", b"orientation", "pose", b"pose", "refusal", b"refusal", "request_id", b"request_id", "retrieved", b"retrieved", "seconds", b"seconds", "status", b"status", "tile", b"tile"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__coarse: _TypeAlias = _typing.Literal["coarse"]  # noqa: Y015
+    _WhichOneofArgType__coarse: _TypeAlias = _typing.Literal["_coarse", b"_coarse"]  # noqa: Y015
     _WhichOneofReturnType__debug: _TypeAlias = _typing.Literal["debug"]  # noqa: Y015
     _WhichOneofArgType__debug: _TypeAlias = _typing.Literal["_debug", b"_debug"]  # noqa: Y015
     _WhichOneofReturnType__geopose: _TypeAlias = _typing.Literal["geopose"]  # noqa: Y015
@@ -1396,6 +1476,8 @@ class LocalizeResponse(_message.Message):
     _WhichOneofArgType__refusal: _TypeAlias = _typing.Literal["_refusal", b"_refusal"]  # noqa: Y015
     _WhichOneofReturnType__tile: _TypeAlias = _typing.Literal["tile"]  # noqa: Y015
     _WhichOneofArgType__tile: _TypeAlias = _typing.Literal["_tile", b"_tile"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__coarse) -> _WhichOneofReturnType__coarse | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__debug) -> _WhichOneofReturnType__debug | None: ...
     @_typing.overload

@@ -23,7 +23,7 @@ from visloc_api.words.base import (
     OneOf,
 )
 from visloc_api.words.geopose import GeoPose, GeoPoseYpr
-from visloc_api.words.poses import PoseEstimate, RigPose, SentPose
+from visloc_api.words.poses import CoarsePose, PoseEstimate, RigPose, SentPose
 
 # A sequence has thousands of images, and each may have been matched against a thousand photos.
 MAX_RETRIEVED = 20
@@ -203,7 +203,10 @@ class LocalizeResponse(AnswerWithArrays):
     """The answer: a pose, or the reason why there is none."""
 
     request_id: _RequestId
-    status: Literal["localized", "not_localized"]
+    status: Annotated[
+        Literal["localized", "coarse", "not_localized"],
+        Field(description="coarse: not localized, but there is a coarse pose"),
+    ]
     pose: Annotated[PoseEstimate | None, Field(description="null when not localized")]
     refusal: Annotated[Refusal | None, Field(description="null when localized")]
     keypoints: Annotated[int, Field(description="found in the photo")]
@@ -227,19 +230,25 @@ class LocalizeResponse(AnswerWithArrays):
     geopose_ypr: _Ypr = None
     debug: Annotated[Debug | None, Field(description="the matches, when asked for")] = None
     tile: _TileRef = None
+    coarse: Annotated[
+        CoarsePose | None,
+        Field(description="of status coarse: the pose that options.fallback asked for; else null"),
+    ] = None
 
     @model_validator(mode="after")
     def _check_status(self) -> Self:
-        if (self.status, self.pose is None, self.refusal is None) not in (
-            ("localized", False, True),
-            ("not_localized", True, False),
+        has = (self.pose is not None, self.refusal is not None, self.coarse is not None)
+        if (self.status, *has) not in (
+            ("localized", True, False, False),
+            ("coarse", False, True, True),
+            ("not_localized", False, True, False),
         ):
             raise ValueError(f"status {self.status!r} does not fit pose and refusal")
         return self
 
     @property
     def localized(self) -> bool:
-        """Whether there is a pose."""
+        """Whether there is a pose; False with a coarse one only."""
         return self.pose is not None
 
 

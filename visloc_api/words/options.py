@@ -22,6 +22,7 @@ _MESSAGES = {
     "fusion": "the fusion is unknown",
     "matcher": "the matcher is unknown",
     "solver": "the solver is unknown",
+    "fallback": "the fallback is unknown",
 }
 
 
@@ -117,9 +118,11 @@ class LocalizeOptions(IncomingMessage):
     fusion_weights: Annotated[
         dict[str, float] | None, converted(_check_names), _option("fusion_weights")
     ] = None
+    fusion_parameter: Annotated[float | None, _option("fusion_parameter")] = None
     matcher: Annotated[str | None, _option("matcher")] = None
     solver: Annotated[str | None, _option("solver")] = None
     seed: Annotated[int | None, _option("seed")] = None
+    fallback: Annotated[str | None, _option("fallback")] = None
 
     def to_core(self) -> visloc.options.LocalizeOptions:
         """Return the options, checked."""

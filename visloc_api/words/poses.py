@@ -141,6 +141,38 @@ class PoseEstimate(_PoseWithDigits):
     ] = None
 
 
+class CoarsePose(_PoseWithDigits):
+    """Where the most similar mapping photos say that the photo was taken; nothing confirms it."""
+
+    pose_field = "cam_from_world"
+
+    cam_from_world: SentPose
+    position: Annotated[
+        Numbers3,
+        Field(description="camera centre in the world, metres when the map is metric"),
+    ]
+    orientation: Annotated[Numbers4, Field(description="rotation of world_from_cam as w, x, y, z")]
+    covariance: Annotated[
+        Covariance,
+        Field(
+            description=f"{_COVARIANCE}cam_from_world; learned from the map's own photos, so that "
+            "the ellipsoid of 95 % holds for photos of this place"
+        ),
+    ]
+    position_std: Annotated[
+        Numbers3, Field(description="standard deviations of the position along the world's axes")
+    ]
+    orientation_std_deg: Annotated[Numbers3, Field(description=_ABOUT.format("camera"))]
+    method: Annotated[
+        str,
+        OneOf(visloc.types.CoarseMethod),
+        Field(
+            description="bdi: interpolated as their global descriptors make up the photo's; "
+            "ewb: their mean; csi: their mean weighted by similarity"
+        ),
+    ]
+
+
 class RigPose(_PoseWithDigits):
     """Where the rig was, and how sure that is."""
 

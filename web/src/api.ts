@@ -99,7 +99,8 @@ export interface Candidate {
 
 export interface LocalizeResponse {
   request_id: string;
-  status: "localized" | "not_localized";
+  /** Of status coarse, `pose` is null: the page shows such a photo as not localized. */
+  status: "localized" | "coarse" | "not_localized";
   pose: PoseEstimate | null;
   refusal: { stage: string; reason: string; message: string; candidates: Candidate[] } | null;
   keypoints: number;

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
+import numpy as np
 import pytest
 
 from clients import Client
@@ -20,6 +21,9 @@ from clients.evaluation.results import (
 )
 from clients.evaluation.run import Outcome
 from visloc.errors import DatasetError, InvalidInput
+from visloc.geometry import Pose
+from visloc.sequences.filling import TracedPose
+from visloc.types import PoseSource, Uncertainty
 
 
 def outcome_of(name: str, url: str, image: bytes = b"photo") -> Outcome:
@@ -169,3 +173,35 @@ def test_an_output_that_cannot_be_written_is_found_before_the_run(tmp_path: Path
         with pytest.raises(InvalidInput) as caught:
             check_can_be_written([path])
         assert caught.value.code == "output.folder"
+
+
+COARSE = {
+    "cam_from_world": {"rotation_wxyz": [1.0, 0.0, 0.0, 0.0], "translation": [0.1, 0.2, 0.3]},
+    "position": [-0.1, -0.2, -0.3],
+    "orientation": [1.0, 0.0, 0.0, 0.0],
+    "covariance": np.eye(6).ravel().tolist(),
+    "position_std": [1.0, 1.0, 1.0],
+    "orientation_std_deg": [9.0, 9.0, 9.0],
+    "method": "bdi",
+}
+
+
+def test_a_coarse_pose_stays_one_when_the_photo_is_filled_and_no_longer_filled(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "results.jsonl"
+    line = {"name": "a", "status": "coarse", "pose": None, "source": None, "inliers": 3}
+    path.write_text(json.dumps({**line, "coarse": COARSE}) + "\n")
+    (stored,) = read_results(path)
+    assert (stored.status, stored.pose, stored.is_final) == ("coarse", None, True)
+    assert stored.coarse is not None
+    assert stored.coarse.translation == (0.1, 0.2, 0.3)
+
+    beside = TracedPose(Pose.identity(), np.eye(6), PoseSource.RIG, Uncertainty.WHOLE)
+    copy_lines(path, [stored], path, {"a": beside})
+    assert json.loads(path.read_text())["status"] == "filled"
+    (filled,) = read_results(path)
+    assert (filled.status, filled.filled is None, filled.coarse is None) == ("coarse", False, False)
+
+    copy_lines(path, [filled], path)
+    assert json.loads(path.read_text()) == {**line, "coarse": COARSE}

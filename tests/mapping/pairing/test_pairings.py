@@ -66,7 +66,7 @@ def test_several_descriptors_are_fused_as_in_localization(make_scene: Make) -> N
     expected = set()
     for i in range(300):
         cosines = np.stack([(t.astype(np.float64) @ t[i]) for t in tables.values()])
-        scores = gharm(np.clip(cosines, -1, 1), equal_weights(2))
+        scores = gharm(np.clip(cosines, -1, 1), equal_weights(2), 0.5)
         scores[i] = -np.inf
         for j in np.argsort(-scores, kind="stable")[:3].tolist():
             expected.add((min(i, j), max(i, j)))

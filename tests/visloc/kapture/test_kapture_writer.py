@@ -202,3 +202,43 @@ def test_hostile_text_is_read_or_refused_and_nothing_else(
         except DatasetError as error:
             field = str(error.field)
     assert field.startswith("sensors/")
+
+
+WIFI = """# kapture format: 1.1
+# timestamp, device_id, BSSID, frequency, RSSI, SSID, scan_time_start, scan_time_end
+5, phone, 68:72:51:80:52:df, 5785, -33, M1X_PicoM2, 1555398770280, 1555398770290
+5, phone, 68:9c:e2:e1:b0:60, 5765, -49, , 0, 0
+6, phone, 00:00:00:00:00:01, 2412, -71.5, Café, the 2nd, 0, 0
+"""
+
+
+def test_records_of_other_sensors_are_written_as_they_were_read(tmp_path: Path) -> None:
+    one, other = tmp_path / "one", tmp_path / "other"
+    write_dataset(small_dataset(one))
+    (one / "sensors/records_wifi.txt").write_text(WIFI, encoding="utf-8")
+    pressure = "# kapture format: 1.1\n# timestamp, device_id\n7, phone, 1013.25, 0.5\n"
+    (one / "sensors/records_pressure.txt").write_text(pressure)
+
+    read = read_dataset(one)
+    write_dataset(replace(read, root=other))
+
+    assert read.other_records.keys() == {"records_wifi.txt", "records_pressure.txt"}
+    assert read.other_records["records_pressure.txt"] == (("7", "phone", "1013.25", "0.5"),)
+    assert read_dataset(other).other_records == read.other_records
+    rows = (other / "sensors/records_wifi.txt").read_text(encoding="utf-8").splitlines()
+    assert [", ".join(map(str.strip, row.split(","))) for row in rows] == WIFI.splitlines()
+    assert read.without_records().other_records == {}
+
+
+@pytest.mark.parametrize(
+    ("row", "code"), [("5, phone", "kapture.column_count"), ("x, phone, 1", "kapture.timestamp")]
+)
+def test_a_row_of_another_sensor_without_a_time_or_a_value_is_refused(
+    tmp_path: Path, row: str, code: str
+) -> None:
+    write_dataset(small_dataset(tmp_path))
+    (tmp_path / "sensors/records_magnetic.txt").write_text(row + "\n")
+    with pytest.raises(DatasetError) as caught:
+        read_dataset(tmp_path)
+    assert caught.value.code == code
+    assert caught.value.field == "sensors/records_magnetic.txt:1"

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 
 import numpy as np
 import pytest
@@ -26,9 +27,11 @@ EVERY = pytest.mark.parametrize("fusion", Fusion)
 cosine = st.floats(-1.0, 1.0)
 
 
-def fused(fusion: Fusion, similarities: Floats, weights: Floats | None = None) -> Floats:
+def fused(
+    fusion: Fusion, similarities: Floats, weights: Floats | None = None, parameter: float = 0.5
+) -> Floats:
     given = equal_weights(len(similarities)) if weights is None else weights
-    return FUSION_OPERATORS[fusion](similarities, given)
+    return FUSION_OPERATORS[fusion](similarities, given, parameter)
 
 
 @st.composite
@@ -67,6 +70,7 @@ def test_every_operator_of_the_options_is_there() -> None:
         (Fusion.MEAN_AND_POWER, 0.45),
         (Fusion.MIN_AND_MAX, 0.5),
         (Fusion.MEAN_AND_MIN, 0.35),
+        (Fusion.VILLENA_ROMAN, 0.42),  # (0.8 + 0.04 / 1) / 2
         (Fusion.HARMONIC, 0.16),  # 1 / mean(1 / 0.4, 1 / 0.1)
         (Fusion.ROUND_ROBIN, 1.0),
     ],
@@ -108,7 +112,7 @@ def test_gharm_of_equal_weights_is_the_formula_to_the_last_bit() -> None:
 @FEW
 @given(tables())
 def test_gharm_of_equal_weights_stays_within_its_bound(similarities: Floats) -> None:
-    scores = gharm(similarities, equal_weights(len(similarities)))
+    scores = gharm(similarities, equal_weights(len(similarities)), 0.5)
     assert (np.abs(scores) <= 1.0 / len(similarities) + 1e-9).all()
 
 
@@ -148,6 +152,8 @@ def test_no_score_falls_when_a_similarity_of_its_photo_rises(
 def test_with_equal_weights_the_order_of_descriptors_does_not_matter(
     fusion: Fusion, similarities: Floats, data: st.DataObject
 ) -> None:
+    if fusion is Fusion.ROUND_ROBIN:
+        return  # descriptors take turns in their order
     order = data.draw(st.permutations(range(len(similarities))))
     assert fused(fusion, similarities[order]) == pytest.approx(
         fused(fusion, similarities), rel=1e-9, abs=1e-12
@@ -161,7 +167,7 @@ def test_descriptors_bring_their_weights_along(
     fusion: Fusion, table: tuple[Floats, Floats], data: st.DataObject
 ) -> None:
     if fusion is Fusion.ROUND_ROBIN:
-        return  # within a round, means that differ in the last bit only decide
+        return  # descriptors take turns in their order
     similarities, weights = table
     order = data.draw(st.permutations(range(len(similarities))))
     assert fused(fusion, similarities[order], weights[order]) == pytest.approx(
@@ -233,12 +239,79 @@ def test_round_robin_takes_the_first_of_each_then_the_second() -> None:
         ]
     )
     scores = fused(Fusion.ROUND_ROBIN, similarities)
-    # Round 1: 0 and 2, whose means are 0.55 and 0.5; round 2: 1 and 3, 0.55 and 0.4; round 3: 4.
+    # Round 1: 0 and 2; round 2: 1 and 3; round 3: 4.
     assert np.argsort(-scores).tolist() == [0, 2, 1, 3, 4]
     assert np.sort(scores)[::-1] == pytest.approx([1, 1 / 2, 1 / 3, 1 / 4, 1 / 5])
-    # Of more weight, the second descriptor comes first within each round.
-    weighted = fused(Fusion.ROUND_ROBIN, similarities, np.array([0.3, 0.7]))
+    # The other descriptor goes first when it comes first, whatever it weighs.
+    weighted = fused(Fusion.ROUND_ROBIN, similarities[::-1], np.array([0.3, 0.7]))
     assert np.argsort(-weighted).tolist() == [2, 0, 3, 1, 4]
+
+
+def robin_of_the_paper(similarities: Floats, k: int) -> list[int]:
+    """Take rank 1 of each list in turn, then rank 2, and so on; skip what was taken; stop at k."""
+    taken: list[int] = []
+    for photos in np.argsort(-similarities, axis=1).T:
+        for photo in photos:
+            if photo not in taken:
+                taken.append(int(photo))
+    return taken[:k]
+
+
+def test_round_robin_takes_what_the_paper_takes_in_2000_random_cases() -> None:
+    rng = np.random.default_rng(0)
+    for case in range(2000):
+        similarities = rng.uniform(-1, 1, (2 + case % 4, 50))
+        order = np.argsort(-fused(Fusion.ROUND_ROBIN, similarities), kind="stable")
+        for k in (5, 10, 20):
+            assert order[:k].tolist() == robin_of_the_paper(similarities, k)
+
+
+def formulas(s: list[float], a: list[float], p: float) -> dict[Fusion, float]:
+    """The operators of the paper (appendix B) and of kapture, one photo at a time."""
+    mean = math.fsum(x * y for x, y in zip(a, s, strict=True))
+    power = math.prod(y**x for x, y in zip(a, s, strict=True))
+    low, high, m = min(s), max(s), len(s)
+    gharm_mean = math.fsum(1 / (p + x * y) for x, y in zip(a, s, strict=True)) / m
+    return {
+        Fusion.GHARM: 1 / gharm_mean - p,
+        Fusion.MEAN: mean,
+        Fusion.POWER: power,
+        Fusion.MIN: low,
+        Fusion.MAX: high,
+        Fusion.MEAN_AND_POWER: p * mean + (1 - p) * power,
+        Fusion.MIN_AND_MAX: p * low + (1 - p) * high,
+        Fusion.MEAN_AND_MIN: p * mean + (1 - p) * low,
+        Fusion.VILLENA_ROMAN: (1 - p) * high + p * low**2 / (high + low),
+        Fusion.HARMONIC: 1 / (m * math.fsum(x / y for x, y in zip(a, s, strict=True))),
+    }
+
+
+def test_operators_are_their_formulas_in_2000_random_cases() -> None:
+    rng = np.random.default_rng(1)
+    for case in range(2000):
+        m = 2 + case % 4
+        similarities, weights = rng.uniform(0.01, 1, (m, 1)), rng.dirichlet(np.ones(m))
+        parameter = 0.5 if case % 2 else float(rng.uniform(0, 1))
+        expected = formulas(similarities[:, 0].tolist(), weights.tolist(), parameter)
+        for fusion, value in expected.items():
+            found = float(fused(fusion, similarities, weights, parameter)[0])
+            assert found == pytest.approx(value, abs=1e-12), fusion
+
+
+def test_a_large_gamma_tends_to_the_mean() -> None:
+    similarities = np.random.default_rng(2).uniform(-1, 1, (3, 20))
+    np.testing.assert_allclose(
+        fused(Fusion.GHARM, similarities, parameter=100.0), similarities.mean(axis=0) / 3, atol=2e-3
+    )
+
+
+def test_a_share_above_one_is_refused_where_it_is_a_share() -> None:
+    large = LocalizeOptions(fusion_parameter=2.0)
+    assert chosen_fusion(large, EQUAL_GHARM, ("a",)).parameter == 2.0
+    for fusion in (Fusion.MEAN_AND_MIN, Fusion.VILLENA_ROMAN):
+        with pytest.raises(InvalidInput) as caught:
+            chosen_fusion(large, LateFusion(fusion), ("a",))
+        assert caught.value.code == "options.fusion_parameter"
 
 
 def test_photos_that_nothing_tells_apart_share_a_place() -> None:

@@ -1,0 +1,80 @@
+"""Weights of retrieved photos, with which their poses approximate that of the query.
+
+Pion, Humenberger, Csurka, Cabon and Sattler, "Benchmarking Image Retrieval for Visual
+Localization" (3DV 2020), section 3.1. The pose itself is averaged by ``visloc.pose.average``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from visloc.types import CoarseMethod
+
+# Of the cosine in CSI; the paper's and kapture-localization's default.
+CSI_POWER = 8.0
+
+# Takes unit rows: the query (D,) and retrieved photos (k, D). Returns (k,) of sum 1.
+Weighting = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
+
+
+def equal_weighted(query: NDArray[np.float64], photos: NDArray[np.float64]) -> NDArray[np.float64]:
+    """EWB, equal weighted barycentre: ``w_i = 1 / k``."""
+    del query
+    return np.full(len(photos), 1.0 / len(photos))
+
+
+def barycentric(query: NDArray[np.float64], photos: NDArray[np.float64]) -> NDArray[np.float64]:
+    """BDI, barycentric descriptor interpolation: ``argmin |q - sum(w_i d_i)|`` with sum 1.
+
+    Weights may be negative. Where several are as good, as of photos that are the same, these are
+    the ones nearest to equal weights.
+    """
+    equal = equal_weighted(query, photos)
+    # Differences from equal weights that keep the sum: orthogonal to (1, ..., 1).
+    centred = photos - photos.mean(axis=0)
+    rest = np.linalg.lstsq(centred.T, query - equal @ photos, rcond=1e-9)[0]
+    return np.asarray(equal + rest - rest.mean())
+
+
+def cosine_similarity(
+    query: NDArray[np.float64], photos: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """CSI, cosine similarity: ``w_i = (q . d_i)^8 / sum_j (q . d_j)^8``.
+
+    A negative cosine is no similarity and counts 0, where an even power would count it. Equal
+    weights if nothing is similar.
+    """
+    similar = np.maximum(photos @ query, 0.0)
+    if similar.max(initial=0.0) <= 0.0:
+        return equal_weighted(query, photos)
+    powers = (similar / similar.max()) ** CSI_POWER
+    return np.asarray(powers / powers.sum())
+
+
+WEIGHTINGS: Mapping[CoarseMethod, Weighting] = {
+    CoarseMethod.EWB: equal_weighted,
+    CoarseMethod.BDI: barycentric,
+    CoarseMethod.CSI: cosine_similarity,
+}
+
+
+def joined(
+    descriptors: Mapping[str, NDArray[np.floating]], weights: Mapping[str, float] | None
+) -> NDArray[np.float64]:
+    """Join unit vectors (D,) or rows (n, D) of several global descriptors to one of unit length.
+
+    The cosine of two joined vectors is the weighted mean of their cosines by descriptor.
+
+    Args:
+        descriptors: by name.
+        weights: positive, of any sum, for each of them; None weighs all equally.
+    """
+    total = len(descriptors) if weights is None else sum(weights[name] for name in descriptors)
+    parts = [
+        np.asarray(rows, np.float64) * np.sqrt((1.0 if weights is None else weights[name]) / total)
+        for name, rows in descriptors.items()
+    ]
+    return np.concatenate(parts, axis=-1)
