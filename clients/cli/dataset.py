@@ -84,13 +84,16 @@ class DatasetRun(Photos, QueryOptions):
             max_gap_s=self.max_gap,
         )
 
-    def of_mode(self, mode: Mode, arrangement: Arrangement) -> dict[str, object]:
-        """Return the options that count for a mode, for the description of a run."""
+    def further(self, mode: Mode, arrangement: Arrangement) -> dict[str, object]:
+        """Return the options that count for a mode and a list, for the description of a run."""
+        told: dict[str, object] = {}
+        if self.image_root is not None:
+            told["image_root"] = str(self.image_root.resolve())
         if mode is Mode.GP3P:
-            return {"rig": self.rig}
-        if mode.fills_sequences:
-            return {"time_unit": arrangement.time_unit, "max_gap_s": arrangement.max_gap_s}
-        return {}
+            told["rig"] = self.rig
+        elif mode.fills_sequences:
+            told |= {"time_unit": arrangement.time_unit, "max_gap_s": arrangement.max_gap_s}
+        return told
 
 
 @spread
@@ -123,7 +126,7 @@ def localize_batch(
     read = run.reader(info)
     batch = Batch(
         *(output, run.source, run.features_dir, run.pixel_origin, info.ref, options, mode),
-        run.of_mode(mode, arrangement),
+        run.further(mode, arrangement),
     )
     done = open_batch(batch, restart=restart)
     photos = queries.photos

@@ -1,4 +1,4 @@
-"""``localize evaluate``."""
+"""``localize evaluate`` and ``localize submit``."""
 
 from __future__ import annotations
 
@@ -16,8 +16,10 @@ from rich.table import Table
 from clients.cli.compare_display import clean
 from clients.cli.display import print_line
 from clients.cli.options import Thresholds, thresholds_of
-from clients.evaluation.results import check_can_be_written, write_whole
+from clients.evaluation.pose_files import read_poses
+from clients.evaluation.results import check_can_be_written, write_poses, write_whole
 from clients.evaluation.scoring import read_conditions, read_scene, score
+from clients.evaluation.submission import Benchmark, make_submission
 from visloc.errors import refuse
 
 _out = Console()
@@ -86,6 +88,45 @@ def evaluate(
         if scene["unknown"]:
             text = f"{scene['unknown']} poses of photos without a true pose ({scene['scene']})"
             print_line(_out, "not counted", text, "yellow")
+
+
+def submit(
+    results: Annotated[
+        Path,
+        typer.Argument(metavar="RESULTS", help="The folder of localize batch, or results.jsonl."),
+    ],
+    *,
+    benchmark: Annotated[
+        Benchmark, typer.Option("--set", help="The data set, whose names are written.")
+    ],
+    output: Annotated[Path, typer.Option(metavar="FILE", help="The file to upload.")],
+    mapping: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DATASET",
+            help="The mapping photos and their poses, in any format of localize evaluate. A photo "
+            "without a pose then gets that of the first photo that was retrieved for it.",
+        ),
+    ] = None,
+) -> None:
+    """Write the poses of a batch as visuallocalization.net takes them.
+
+    Names are file names; for robotcar with the camera's folder, such as rear/1.jpg. Tells how many
+    poses were filled, and how many photos have none. Needs no server.
+
+    Exits with 0 when done, 1 on an error.
+    """
+    check_can_be_written([output])
+    made = make_submission(results, benchmark, {} if mapping is None else read_poses(mapping))
+    write_poses(output, made.poses.items())
+    counts = made.counts
+    _out.print(
+        f"{counts.total()} photos: {counts['localized']} localized, {counts['filled']} filled "
+        f"from other photos, {counts['retrieved']} filled from the first retrieved photo, "
+        f"{counts['missing']} without a pose",
+        highlight=False,
+        soft_wrap=True,
+    )
 
 
 def _table(figures: Mapping[str, Any]) -> Table:

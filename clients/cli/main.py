@@ -14,7 +14,7 @@ from rich.console import Console
 from clients.cli.compare import compare
 from clients.cli.dataset import benchmark, localize_batch
 from clients.cli.display import UNKNOWN_UNIT, print_line, print_result, unit_of
-from clients.cli.evaluate import evaluate
+from clients.cli.evaluate import evaluate, submit
 from clients.cli.maps import maps_app
 from clients.cli.options import Connection, MapRef, QueryOptions, priors_from_text, spread
 from clients.client import Client
@@ -118,6 +118,7 @@ app.command()(benchmark)
 app.add_typer(maps_app, name="maps")
 app.command()(compare)
 app.command()(evaluate)
+app.command()(submit)
 
 
 def _unit(client: Client, map_ref: str) -> str:
