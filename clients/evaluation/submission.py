@@ -1,9 +1,9 @@
 """Poses for visuallocalization.net, under the names that it knows.
 
-Its rules, as hloc (``localize_sfm.py``) and kapture (``kapture_export_LTVL2020.py``) follow them: a
-line ``name qw qx qy qz tx ty tz`` of ``cam_from_world`` for each photo. The name has no folders; for
-RobotCar Seasons it has the camera's. A photo without a pose gets that of the first retrieved mapping
-photo, as in hloc.
+Its rules, as hloc (``localize_sfm.py``) and kapture (``kapture_export_LTVL2020.py``) follow them:
+a line ``name qw qx qy qz tx ty tz`` of ``cam_from_world`` for each photo. The name has no folders;
+for RobotCar Seasons it has the camera's. A photo without a pose gets that of the first retrieved
+mapping photo, as in hloc.
 """
 
 from __future__ import annotations
