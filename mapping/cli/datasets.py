@@ -1,4 +1,4 @@
-"""Commands about datasets: ``pairs``, ``calibrate-rig``, ``export-features`` and ``sample``."""
+"""Commands about datasets: pairs, rigs, features of ours and of others, the sample."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from mapping.cli.display import ERR, print_rig, say, say_notes, say_peak_memory
 from mapping.cli.progress import StageProgress
 from mapping.cluster.storage import map_folder
 from mapping.frames.rig_calibration import calibrate_rig, refuse_known_rigs, write_calibration
+from mapping.importers.hloc import import_features
 from mapping.maps.export_features import export_features
 from mapping.options import (
     DatasetArgument,
@@ -114,6 +115,28 @@ def export_features_command(
     for name in absent:
         ERR.print(f"absent, without features: {name}", markup=False, soft_wrap=True)
     say(f"kapture with features: {output}")
+
+
+def import_features_command(
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FILE.h5...", help="features.h5, global features and matches.h5 of hloc."
+        ),
+    ],
+    output: Annotated[Path, typer.Option("--output", help="Folder for --features-dir of a build.")],
+    type_name: Annotated[
+        str, typer.Option("--type", metavar="NAME", help="Name of the features: kapture:NAME.")
+    ] = "hloc",
+) -> None:
+    """Write features and matches of hloc in kapture's layout, for build and localize batch."""
+    written = import_features(files, output, type_name)
+    say(
+        f"{written['local']} photos with local features, {written['global']} with global ones, "
+        f"{written['pairs']} pairs with matches: {output}"
+    )
+    if written["pairs"]:
+        say(f"next: --matches-dir {output / 'reconstruction' / 'matches' / type_name}")
 
 
 def sample(

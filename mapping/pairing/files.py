@@ -9,6 +9,7 @@ import numpy as np
 
 from mapping.pairing.ranking import unite
 from mapping.pairing.scene import Pairs, Scene
+from visloc.kapture.matches import MatchFiles
 from visloc.kapture.pairs import PairRow, read_pair_rows, write_pair_rows
 from visloc.kapture.text import relative_path
 
@@ -44,6 +45,20 @@ def read_pairs(path: Path, scene: Scene) -> Pairs:
         second.append(rows[1])
         scores.append(1.0 if pair.score is None else pair.score)
     return unite([(np.array(first), np.array(second), np.array(scores))])
+
+
+def matched_pairs(matches: MatchFiles, scene: Scene) -> Pairs:
+    """Return the pairs of the scene's photos that have a file of matches, each with score 1."""
+    row_of = {name: row for row, name in enumerate(scene.names)}
+    rows = np.array(
+        [
+            (row_of[first], row_of[second])
+            for first, second in matches.pairs()
+            if first in row_of and second in row_of and first != second
+        ],
+        dtype=np.int64,
+    ).reshape(-1, 2)
+    return unite([(rows[:, 0], rows[:, 1], np.ones(len(rows)))])
 
 
 def _row(row_of: dict[str, int], name: str, pair: PairRow) -> int:

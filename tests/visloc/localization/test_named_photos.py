@@ -52,7 +52,8 @@ def test_the_retrieved_photos_named_again_give_the_same_answer(
     assert names(again) == names(retrieved)
     assert len(names(again)) == 5
     for first, second in zip(retrieved.evidence.retrieved, again.evidence.retrieved, strict=True):
-        assert first.similarities == pytest.approx(second.similarities)
+        # Rows one by one, or in one product: other rounding.
+        assert first.similarities == pytest.approx(second.similarities, abs=1e-6)
     assert (again.cam_from_world.center == retrieved.cam_from_world.center).all()
 
 
