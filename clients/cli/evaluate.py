@@ -130,14 +130,16 @@ def submit(
 
 
 def _table(figures: Mapping[str, Any]) -> Table:
-    table = Table(box=SIMPLE_HEAD, pad_edge=False)
-    table.add_column("", overflow="fold", min_width=16)
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
+    table.add_column("", overflow="fold", min_width=12)
     average = figures["average"]
     bins = [
         f"{each['max_position_error_m']:g} m\n{each['max_orientation_error_deg']:g}°"
         for each in average["recall"]
     ]
-    for title in ("with\npose", *bins, "median", "of all", "inside\n95 %"):
+    # The median over all photos is another one only where photos have no pose.
+    titles = ["median", "of all"] if _lacks_poses(figures) else ["median"]
+    for title in ("with\npose", *bins, *titles, "inside\n95 %"):
         table.add_column(title, justify="right", no_wrap=True)
     for label, row in _rows(figures):
         held = row["calibration"]
@@ -145,13 +147,17 @@ def _table(figures: Mapping[str, Any]) -> Table:
             escape(clean(label)),
             f"{row['with_pose']} of {row['photos']}",
             *_shares(row),
-            *_medians(row),
+            *_medians(row)[: len(titles)],
             "-" if held is None else f"{held['inside_95']:.1%}",
         )
     if average["rows"] > 1:
         table.add_section()
-        table.add_row("average", "", *_shares(average), *_medians(average), "")
+        table.add_row("average", "", *_shares(average), *_medians(average)[: len(titles)], "")
     return table
+
+
+def _lacks_poses(figures: Mapping[str, Any]) -> bool:
+    return any(scene["with_pose"] < scene["photos"] for scene in figures["scenes"])
 
 
 def _rows(figures: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:

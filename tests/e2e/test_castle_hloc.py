@@ -107,7 +107,6 @@ def test_castle_is_mapped_and_localized_from_hlocs_files(shared_data: Path, tmp_
         name: [pose_error(pose, true)[0] for pose, true in zip(found, truth, strict=True) if true]
         for name, found in poses.items()
     }
-    print(apart, errors)
     assert len(apart) == 9
     assert max(apart) < 0.01
     assert np.median(errors["hloc"]) < 0.04
