@@ -294,6 +294,11 @@ class Localized:
     uncertainty: Uncertainty
     probability: float | None = None
 
+    @property
+    def status(self) -> Literal["localized"]:
+        """The word of the API."""
+        return "localized"
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
@@ -335,6 +340,11 @@ class NotLocalized:
     reason: Reason
     message: str
     candidates: tuple[Candidate, ...] = ()
+
+    @property
+    def status(self) -> Literal["not_localized"]:
+        """The word of the API."""
+        return "not_localized"
 
 
 Answer = Localized | NotLocalized

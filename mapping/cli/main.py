@@ -14,6 +14,7 @@ from mapping.cli.build import build, import_
 from mapping.cli.capture import capture
 from mapping.cli.datasets import (
     calibrate_rig_command,
+    dataset,
     export_features_command,
     import_features_command,
     pairs,
@@ -49,6 +50,7 @@ COMMANDS: Mapping[str, Callable[..., None]] = {
     "split": split,
     "update": update,
     "export-features": export_features_command,
+    "dataset": dataset,
     "import-features": import_features_command,
     "sample": sample,
 }

@@ -29,7 +29,8 @@ CREATE TABLE cameras (camera_id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, mode
   prior_focal_length INTEGER NOT NULL);
 CREATE TABLE images (image_id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL,
   name TEXT NOT NULL UNIQUE, camera_id INTEGER NOT NULL,
-  prior_qw REAL, prior_qx REAL, prior_qy REAL, prior_qz REAL, prior_tx REAL, prior_ty REAL, prior_tz REAL,
+  prior_qw REAL, prior_qx REAL, prior_qy REAL, prior_qz REAL,
+  prior_tx REAL, prior_ty REAL, prior_tz REAL,
   CONSTRAINT image_id_check CHECK(image_id >= 0 and image_id < 2147483647),
   FOREIGN KEY(camera_id) REFERENCES cameras(camera_id));
 CREATE UNIQUE INDEX index_name ON images(name);

@@ -49,6 +49,7 @@ def test_the_retrieved_photos_named_again_give_the_same_answer(
 
     assert isinstance(retrieved, Localized)
     assert isinstance(again, Localized)
+    assert again.status == "localized"
     assert names(again) == names(retrieved)
     assert len(names(again)) == 5
     for first, second in zip(retrieved.evidence.retrieved, again.evidence.retrieved, strict=True):
@@ -90,6 +91,7 @@ def test_priors_leave_out_named_photos_that_they_exclude(
 
     assert isinstance(answer, NotLocalized)
     assert answer.reason is Reason.NO_PHOTO_NEAR
+    assert answer.status == "not_localized"
 
 
 def test_a_photo_that_the_map_lacks_is_refused_before_any_work(
