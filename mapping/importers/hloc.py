@@ -23,8 +23,8 @@ from visloc.errors import VislocError, refuse
 from visloc.kapture import write_global_features, write_keypoints, write_local_features
 from visloc.kapture.matches import write_matches
 
-# More than any photo has: twice what the largest descriptors of 200 000 keypoints take.
-_MAX_VALUES = 2**27
+# More than any photo has: 200 000 descriptors of 256 numbers are 51 millions.
+_MAX_VALUES = 2**26
 
 
 def import_features(files: Sequence[Path], output: Path, type_name: str) -> Counter[str]:
@@ -145,12 +145,17 @@ def _groups(file: Path) -> Iterator[tuple[str, Any]]:
 
 
 def _array(file: Path, name: str, group: Any, key: str, num_axes: int) -> NDArray[Any]:
-    data = group[key]
-    # Such arrays lie in other files, which whoever made this one could choose.
-    elsewhere = data.external is not None or data.is_virtual
-    if elsewhere or len(data.shape) != num_axes or data.size > _MAX_VALUES:
-        raise _wrong(file, name, f"{key} with {num_axes} axes in this file", data.shape)
-    values: NDArray[Any] = data[()]
+    import h5py
+
+    with _errors_of(file):
+        data = group[key] if isinstance(group.get(key, getlink=True), h5py.HardLink) else None
+        expected = f"{key} with {num_axes} axes, in this file"
+        # Linked, external and virtual arrays lie in files that whoever made this one could choose.
+        if not isinstance(data, h5py.Dataset) or data.external is not None or data.is_virtual:
+            raise _wrong(file, name, expected, "something else")
+        if len(data.shape) != num_axes or data.size > _MAX_VALUES:
+            raise _wrong(file, name, expected, data.shape)
+        values: NDArray[Any] = data[()]
     if values.dtype.kind not in "fiu" or not np.isfinite(values).all():
         raise _wrong(file, name, f"{key} of finite numbers", values.dtype)
     return values

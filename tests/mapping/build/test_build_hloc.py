@@ -278,6 +278,24 @@ def test_arrays_of_other_files_are_not_read(tmp_path: Path) -> None:
         group = file.create_group("a.jpg")
         group.create_dataset("keypoints", (3, 2), "f8", external=[(str(secret), 0, 48)])
         file["link.jpg"] = h5py.ExternalLink("other.h5", "/a.jpg")
+    linked = tmp_path / "linked.h5"
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        _photo(file, "b.jpg")
+    with h5py.File(linked, "w") as file:
+        group = file.create_group("a.jpg")
+        group["scores"] = np.ones(3)
+        group["keypoints"] = h5py.ExternalLink(str(tmp_path / "other.h5"), "/b.jpg/keypoints")
+    for each in (path, linked):
+        with pytest.raises(DatasetError) as caught:
+            import_features([each], tmp_path / "out", "hloc")
+        assert caught.value.code == "hloc.group"
+
+
+def test_a_group_in_the_place_of_an_array_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "bad.h5"
+    with h5py.File(path, "w") as file:
+        file["a.jpg/keypoints/inner"] = 1
+        file["a.jpg/scores"] = np.ones(3)
     with pytest.raises(DatasetError) as caught:
         import_features([path], tmp_path / "out", "hloc")
     assert caught.value.code == "hloc.group"
