@@ -18,7 +18,7 @@ _TABLE = re.compile(
 )
 _ROW = re.compile(r"\| `(?P<name>\w+)` \| [^|]* \| (?P<range>[^|]*) \| (?P<meaning>[^|]*) \|")
 # Options whose range the page says in words.
-_IN_WORDS = ("preset", "fusion_weights")
+_IN_WORDS = ("preset", "photos", "fusion_weights")
 
 
 def with_table(text: str) -> str:

@@ -126,6 +126,9 @@ class RegistrationPreset:
     min_inlier_ratio: float
 
 
+# Most mapping photos that one query may name: as many as ``top_k`` may retrieve.
+MAX_PHOTOS = 1000
+
 # Most maps that one query may name.
 MAX_MAPS = 16
 
@@ -189,6 +192,12 @@ class LocalizeOptions:
 
     preset: str = _option(DEFAULT_PRESET, "the thresholds to start from")
     top_k: int = _option(20, "mapping photos to match against", 1, 1000)
+    photos: tuple[str, ...] | None = _option(
+        None,
+        "mapping photos to match against instead of those that retrieval finds, best first",
+        unset="those that retrieval finds",
+        details="Names in the map, each once; all are matched, whatever top_k is.",
+    )
     max_error_px: float | None = _option(
         None, "largest reprojection error of an inlier, pixels", 0.1, 1000.0, unset=_PRESETS_VALUE
     )
@@ -268,6 +277,15 @@ class LocalizeOptions:
                     expected=f"{low} to {high}",
                     got=value,
                 )
+        if self.photos is not None and not (
+            0 < len(self.photos) <= MAX_PHOTOS and len(set(self.photos)) == len(self.photos)
+        ):
+            raise refuse(
+                "options.photos",
+                field="options.photos",
+                expected=f"1 to {MAX_PHOTOS} names, each once",
+                got=f"{len(self.photos)} names, {len(set(self.photos))} different",
+            )
         if self.fusion_weights is not None:
             check_fusion_weights(self.fusion_weights, "options.fusion_weights")
 

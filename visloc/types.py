@@ -302,6 +302,11 @@ class Localized:
     uncertainty: Uncertainty
     probability: float | None = None
 
+    @property
+    def status(self) -> Literal["localized"]:
+        """The word of the API."""
+        return "localized"
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
@@ -365,6 +370,11 @@ class NotLocalized:
     message: str
     candidates: tuple[Candidate, ...] = ()
     coarse: CoarsePose | None = None
+
+    @property
+    def status(self) -> Literal["not_localized"]:
+        """The word of the API."""
+        return "not_localized"
 
 
 Answer = Localized | NotLocalized

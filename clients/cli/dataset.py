@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -28,6 +28,7 @@ from clients.client import AsyncClient
 from clients.evaluation.batch import Batch, finish_batch, open_batch, run_batch
 from clients.evaluation.benchmark import Run, known_poses, make_report
 from clients.evaluation.modes import Arrangement, Mode, arrange, parse_modes
+from clients.evaluation.pairs import read_query_pairs
 from clients.evaluation.queries import QuerySet
 from clients.evaluation.results import check_can_be_written, write_poses, write_whole
 from clients.evaluation.run import InstantOutcome, Outcome, QueryClient, localize_all
@@ -51,6 +52,15 @@ class DatasetRun(Photos, QueryOptions):
     """The options of the commands that localize a dataset in modes."""
 
     map_ref: MapRef
+    pairs: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="The mapping photos of each photo, best first, instead of those that the server "
+            "retrieves: lines 'photo, mapping photo' or 'photo mapping photo', with a score or "
+            "without.",
+        ),
+    ] = None
     concurrency: Annotated[int, typer.Option(min=1, max=1024, help="Photos sent at once.")] = 1
     time_unit: Annotated[
         TimeUnit | None,
@@ -84,13 +94,22 @@ class DatasetRun(Photos, QueryOptions):
             max_gap_s=self.max_gap,
         )
 
-    def of_mode(self, mode: Mode, arrangement: Arrangement) -> dict[str, object]:
-        """Return the options that count for a mode, for the description of a run."""
+    def read_pairs(self, queries: QuerySet) -> Mapping[str, tuple[str, ...]] | None:
+        """Read the pairs, if there are any; raises as ``read_query_pairs``."""
+        return None if self.pairs is None else read_query_pairs(self.pairs, queries.photos)
+
+    def further(self, mode: Mode, arrangement: Arrangement) -> dict[str, object]:
+        """Return the options that count for a mode and a list, for the description of a run."""
+        told: dict[str, object] = {}
+        if self.image_root is not None:
+            told["image_root"] = str(self.image_root.resolve())
+        if self.pairs is not None:
+            told["pairs"] = str(self.pairs.resolve())
         if mode is Mode.GP3P:
-            return {"rig": self.rig}
-        if mode.fills_sequences:
-            return {"time_unit": arrangement.time_unit, "max_gap_s": arrangement.max_gap_s}
-        return {}
+            told["rig"] = self.rig
+        elif mode.fills_sequences:
+            told |= {"time_unit": arrangement.time_unit, "max_gap_s": arrangement.max_gap_s}
+        return told
 
 
 @spread
@@ -118,13 +137,14 @@ def localize_batch(
     Exits with 0 when every photo has its line, 1 on an error, 130 when stopped.
     """
     options, queries = run.options, run.read()
+    pairs = run.read_pairs(queries)
     with connection.client() as client:
         info = client.map(run.map_ref)
     arrangement = run.arrange(queries, [mode], info)
     read = run.reader(info)
     batch = Batch(
         *(output, run.source, run.features_dir, run.pixel_origin, info.ref, options, mode),
-        run.of_mode(mode, arrangement),
+        run.further(mode, arrangement),
     )
     done = open_batch(batch, restart=restart)
     photos = queries.photos
@@ -141,7 +161,7 @@ def localize_batch(
             failed.extend(photo for photo in outcome.photos if photo.error is not None)
 
         async with connection.async_client() as client:
-            asked = QueryClient(client, info.ref, options, read)
+            asked = QueryClient(client, info.ref, options, read, pairs)
             if mode is Mode.GP3P:
                 await run_batch(batch, instants, asked.localize_instant, run.concurrency, count)
             else:
@@ -192,7 +212,9 @@ def benchmark(
         info, about = client.map(run.map_ref), client.server_info()
     arrangement = run.arrange(queries, modes, info)
     read = run.reader(info)
-    ask = partial(QueryClient, map_ref=info.ref, options=options, read=read)
+    ask = partial(
+        QueryClient, map_ref=info.ref, options=options, read=read, pairs=run.read_pairs(queries)
+    )
     timed = {
         in_instants: _timed(connection, ask, arrangement, run.concurrency, in_instants=in_instants)
         for in_instants in sorted({mode is Mode.GP3P for mode in modes})

@@ -15,8 +15,10 @@ from clients.cli.bag import bag
 from clients.cli.compare import compare
 from clients.cli.dataset import benchmark, localize_batch
 from clients.cli.display import UNKNOWN_UNIT, print_line, print_result, unit_of
+from clients.cli.evaluate import evaluate, submit
 from clients.cli.maps import maps_app
 from clients.cli.options import Connection, MapRef, QueryOptions, priors_from_text, spread
+from clients.cli.retrieve import retrieve
 from clients.client import Client
 from clients.errors import not_understood
 from clients.evaluation.results import check_can_be_written, write_whole
@@ -118,6 +120,9 @@ app.command()(benchmark)
 app.add_typer(maps_app, name="maps")
 app.command()(compare)
 app.command()(bag)
+app.command()(evaluate)
+app.command()(submit)
+app.command()(retrieve)
 
 
 def _unit(client: Client, map_ref: str) -> str:

@@ -172,9 +172,16 @@ class Photos:
         typer.Argument(
             metavar="DATASET_OR_LIST",
             help="A kapture folder, or a text file with lines 'image_name' or "
-            "'image_name MODEL width height params...', names relative to its folder.",
+            "'image_name MODEL width height params...', or a quoted pattern of such files.",
         ),
     ]
+    image_root: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="The folder that the names in a list are relative to. Default: the list's.",
+        ),
+    ] = None
     features_dir: Annotated[
         Path | None,
         typer.Option(
@@ -193,7 +200,7 @@ class Photos:
 
     def read(self) -> QuerySet:
         """Read the list of photos; raises as ``read_queries``."""
-        return read_queries(self.source, self.pixel_origin)
+        return read_queries(self.source, self.pixel_origin, self.image_root)
 
     def reader(self, info: MapInfo, *, with_features_dir: bool = True) -> Reader:
         """Choose what is sent to a map; raises as ``choose_reader``."""

@@ -42,7 +42,7 @@ class Batch:
         pixel_origin: of the dataset's cameras and keypoints.
         map_ref: ``id@version``, so that all results are of one map.
         mode: how poses are filled.
-        arranged: further options of the mode, for the description.
+        further: options that not every run has, for the description.
     """
 
     output: Path
@@ -52,7 +52,7 @@ class Batch:
     map_ref: str
     options: LocalizeOptions
     mode: Mode = Mode.SINGLE
-    arranged: Mapping[str, object] = field(default_factory=dict)
+    further: Mapping[str, object] = field(default_factory=dict)
 
     @property
     def results(self) -> Path:
@@ -104,7 +104,8 @@ def open_batch(batch: Batch, *, restart: bool) -> set[str]:
         "options": batch.options.given(),
     }
     if batch.mode is not Mode.SINGLE:
-        described |= {"mode": batch.mode.value, **batch.arranged}
+        described["mode"] = batch.mode.value
+    described |= batch.further
     if batch.results.exists():
         _check_same_run(batch.description, described)
     else:

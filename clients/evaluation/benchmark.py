@@ -5,32 +5,25 @@ from __future__ import annotations
 import math
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from clients.evaluation.accuracy import Compared, accuracy_of, finite
 from clients.evaluation.filling import estimate_of, measured
 from clients.evaluation.modes import Mode
 from clients.evaluation.queries import Query
 from clients.evaluation.run import InstantOutcome, Outcome
 from clients.wire.answers import ServerInfo
 from visloc.errors import InvalidInput, refuse
-from visloc.evaluation import (
-    Threshold,
-    calibration,
-    median_errors_localized,
-    percentile,
-    pose_error,
-    recall,
-)
+from visloc.evaluation import Threshold, percentile
 from visloc.sequences.filling import TracedPose
 from visloc.types import PoseSource, Uncertainty
 from visloc_api.words.maps import MapInfo
 
 # Of probabilities, the low ones matter.
 _PROBABILITY_PERCENTILES = {"p50": 50, "p10": 10, "min": 0}
-_ERROR_PERCENTILES = {"p50": 50, "p75": 75, "p90": 90, "max": 100}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,9 +140,6 @@ def figures_of(
     run: Run, poses: Sequence[TracedPose | None], thresholds: Sequence[Threshold]
 ) -> dict[str, Any]:
     """Summarize one run as ``make_report`` does."""
-    errors = pose_errors(run.outcomes, poses)
-    num_with_truth = sum(outcome.query.truth is not None for outcome in run.outcomes)
-    median_position_m, median_orientation_deg = median_errors_localized(errors)
     sources = _sources(poses)
     num_localized = sources.get(PoseSource.ESTIMATED.value, {}).get("poses", 0)
     return {
@@ -160,43 +150,24 @@ def figures_of(
         "instants": None
         if run.instants is None
         else {"asked": len(run.instants), "localized": sum(i.localized for i in run.instants)},
-        "median_position_error_m": _finite(median_position_m),
-        "median_orientation_error_deg": _finite(median_orientation_deg),
-        "position_error_m": _error_percentiles([position for position, _ in errors]),
-        "orientation_error_deg": _error_percentiles([orientation for _, orientation in errors]),
-        "calibration": _calibration(run.outcomes, poses),
+        **accuracy_of(_compared(run.outcomes, poses), thresholds),
         "uncertainty": _uncertainty(poses),
         "probability": _probability(run.outcomes),
-        "recall": _recall(errors, num_with_truth, thresholds),
-        "latency_s": {f"p{q}": _finite(percentile(run.latencies_s, q)) for q in (50, 90, 99)},
+        "latency_s": {f"p{q}": finite(percentile(run.latencies_s, q)) for q in (50, 90, 99)},
         "throughput_qps": len(run.latencies_s) / run.wall_s if run.wall_s > 0 else None,
         "stage_seconds": _mean_by_stage(run.stage_seconds),
     }
 
 
-def pose_errors(
-    outcomes: Sequence[Outcome], poses: Sequence[TracedPose | None]
-) -> list[tuple[float, float]]:
-    """Return (metres, degrees) for each photo that has a pose and whose true pose is known."""
+def _compared(outcomes: Sequence[Outcome], poses: Sequence[TracedPose | None]) -> list[Compared]:
+    """Return the photos whose true pose is known, each with its pose."""
     return [
-        pose_error(pose.pose, outcome.query.truth)
+        Compared(outcome.query.truth, None)
+        if pose is None
+        else Compared(outcome.query.truth, pose.pose, pose.covariance)
         for outcome, pose in zip(outcomes, poses, strict=True)
-        if pose is not None and outcome.query.truth is not None
+        if outcome.query.truth is not None
     ]
-
-
-def _calibration(
-    outcomes: Sequence[Outcome], poses: Sequence[TracedPose | None]
-) -> dict[str, float] | None:
-    """Whether the stated uncertainties hold, over photos with a pose and a known true one."""
-    held = calibration(
-        [
-            (pose.pose, pose.covariance, outcome.query.truth)
-            for outcome, pose in zip(outcomes, poses, strict=True)
-            if pose is not None and outcome.query.truth is not None
-        ]
-    )
-    return None if held is None else asdict(held)
 
 
 def _uncertainty(poses: Sequence[TracedPose | None]) -> str | None:
@@ -238,36 +209,9 @@ def _sources(poses: Sequence[TracedPose | None]) -> dict[str, dict[str, float]]:
     }
 
 
-def _error_percentiles(values: Sequence[float]) -> dict[str, float] | None:
-    # Interpolated, so that p50 is the median above.
-    if not values:
-        return None
-    return {name: float(np.percentile(values, q)) for name, q in _ERROR_PERCENTILES.items()}
-
-
-def _recall(
-    errors: Sequence[tuple[float, float]], num_queries: int, thresholds: Sequence[Threshold]
-) -> list[dict[str, float]] | None:
-    if num_queries == 0:
-        return None
-    fractions = recall(errors, num_queries, thresholds)
-    return [
-        {
-            "max_position_error_m": threshold.max_position_error_m,
-            "max_orientation_error_deg": threshold.max_orientation_error_deg,
-            "fraction": fraction,
-        }
-        for threshold, fraction in zip(thresholds, fractions, strict=True)
-    ]
-
-
 def _mean_by_stage(answers: Sequence[Mapping[str, float]]) -> dict[str, float]:
     by_stage: dict[str, list[float]] = defaultdict(list)
     for answer in answers:
         for stage, seconds in answer.items():
             by_stage[stage].append(seconds)
     return {stage: math.fsum(values) / len(values) for stage, values in by_stage.items()}
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None

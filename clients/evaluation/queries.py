@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -55,22 +55,30 @@ class QuerySet:
     rigs: Mapping[str, Mapping[str, Pose | None]]
 
 
-def read_queries(source: Path, origin: PixelOrigin = PixelOrigin.CORNER) -> QuerySet:
+def read_queries(
+    source: Path, origin: PixelOrigin = PixelOrigin.CORNER, image_root: Path | None = None
+) -> QuerySet:
     """Read a kapture folder or a text file that lists photos, in their order.
 
     Each line of a list is ``image_name`` or ``image_name MODEL width height params...``,
-    separated by blanks, with names relative to the folder of the list. Empty lines and those
-    that begin with ``#`` are skipped. For UNKNOWN_CAMERA, here or in kapture, no camera is sent.
-    Principal points count from ``origin``.
+    separated by blanks. Empty lines and those that begin with ``#`` are skipped. For
+    UNKNOWN_CAMERA, here or in kapture, no camera is sent. Principal points count from ``origin``.
+
+    Args:
+        source: the folder, the list, or a pattern of lists such as ``queries/*_time_queries.txt``.
+        image_root: the folder that names in a list are relative to; by default that of the list.
 
     Raises:
         DatasetError: codes ``kapture.*``, ``list.*``, ``camera.*``; ``queries.missing`` when
             there is nothing at ``source``, ``queries.empty`` when it holds no photo.
+        InvalidInput: ``queries.image_root`` for a kapture folder.
     """
     if source.is_dir():
+        if image_root is not None:
+            raise refuse("queries.image_root", field="image_root", got=str(image_root))
         queries = _read_kapture(source, origin)
-    elif source.is_file():
-        queries = QuerySet(source, tuple(_read_list(source, origin)), {})
+    elif lists := _lists_of(source):
+        queries = QuerySet(source, tuple(_read_lists(lists, origin, image_root)), {})
     else:
         raise refuse("queries.missing", field=str(source))
     if not queries.photos:
@@ -98,7 +106,25 @@ def _read_kapture(root: Path, origin: PixelOrigin) -> QuerySet:
     return QuerySet(root, tuple(photos), dataset.rigs)
 
 
-def _read_list(path: Path, origin: PixelOrigin) -> list[Query]:
+def _lists_of(source: Path) -> list[Path]:
+    if source.is_file():
+        return [source]
+    return sorted(path for path in source.parent.glob(source.name) if path.is_file())
+
+
+def _read_lists(
+    paths: Sequence[Path], origin: PixelOrigin, image_root: Path | None
+) -> Iterator[Query]:
+    seen: set[str] = set()
+    for path in paths:
+        for query in _read_list(path, origin, path.parent if image_root is None else image_root):
+            if query.name in seen:
+                raise refuse("list.duplicate", field=str(path), got=query.name)
+            seen.add(query.name)
+            yield query
+
+
+def _read_list(path: Path, origin: PixelOrigin, folder: Path) -> list[Query]:
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -115,7 +141,7 @@ def _read_list(path: Path, origin: PixelOrigin) -> list[Query]:
         camera = _parse_camera(where, fields[1:])
         if camera is not None:
             camera = camera.with_pixels_from(origin)
-        queries[name] = Query(name, path.parent / name, camera, None)
+        queries[name] = Query(name, folder / name, camera, None)
     return list(queries.values())
 
 

@@ -15,6 +15,7 @@ from clients.evaluation.filling import pose_as_json, uncertainty_of
 from clients.evaluation.run import Outcome
 from clients.wire.answers import parse_coarse, parse_pose
 from visloc.errors import InvalidInput, refuse
+from visloc.geometry import Pose
 from visloc.sequences.filling import TracedPose
 from visloc.types import PoseSource
 from visloc_api.words.poses import CoarsePose, PoseEstimate
@@ -36,6 +37,7 @@ class StoredResult:
             filling.
         pose: when localized.
         filled: the pose from other photos, when the line has one.
+        retrieved: names of the mapping photos that were matched against, best first.
         is_final: False for errors of the server: the photo is sent again.
         coarse: the pose that retrieval alone told.
         offset: of the line in the file, bytes.
@@ -47,6 +49,7 @@ class StoredResult:
     pose: PoseEstimate | None
     num_inliers: int
     filled: TracedPose | None
+    retrieved: tuple[str, ...]
     is_final: bool
     coarse: CoarsePose | None
     offset: int
@@ -142,7 +145,7 @@ def copy_lines(
         write_whole(target, lines())
 
 
-def write_poses(path: Path, poses: Iterable[tuple[str, PoseEstimate | CoarsePose]]) -> None:
+def write_poses(path: Path, poses: Iterable[tuple[str, PoseEstimate | CoarsePose | Pose]]) -> None:
     """Write ``name qw qx qy qz tx ty tz`` lines of ``cam_from_world``, every digit as received.
 
     Readers of this format split at blanks, so blanks in a name, and ``%``, are percent-encoded:
@@ -177,7 +180,16 @@ def check_can_be_written(paths: Sequence[Path]) -> None:
 
 def _parse_line(
     line: bytes,
-) -> tuple[str, str, PoseEstimate | None, int, TracedPose | None, bool, CoarsePose | None]:
+) -> tuple[
+    str,
+    str,
+    PoseEstimate | None,
+    int,
+    TracedPose | None,
+    tuple[str, ...],
+    bool,
+    CoarsePose | None,
+]:
     entry = json.loads(line)
     name, status = entry["name"], entry["status"]
     filled = None
@@ -193,8 +205,9 @@ def _parse_line(
     is_final = status != _ERROR or not (
         entry["error"]["code"] in _PASSING_CODES or entry["error"]["kind"] in _PASSING_KINDS
     )
+    retrieved = tuple(str(each["image"]) for each in entry.get("retrieved", ()))
     coarse = parse_coarse(entry["coarse"]) if status == _COARSE else None
-    return name, status, pose, num_inliers, filled, is_final, coarse
+    return name, status, pose, num_inliers, filled, retrieved, is_final, coarse
 
 
 def _before_filling(entry: Mapping[str, Any]) -> str:
@@ -221,8 +234,8 @@ def _fill(entry: dict[str, Any], pose: TracedPose) -> None:
     entry["pose"] = pose_as_json(pose)
 
 
-def _pose_line(name: str, pose: PoseEstimate | CoarsePose) -> str:
-    numbers = (repr(value) for value in (*pose.rotation_wxyz, *pose.translation))
+def _pose_line(name: str, pose: PoseEstimate | CoarsePose | Pose) -> str:
+    numbers = (repr(float(value)) for value in (*pose.rotation_wxyz, *pose.translation))
     encoded = re.sub(r"[\s%]", lambda found: quote(found[0]), name)
     return f"{encoded} {' '.join(numbers)}\n"
 

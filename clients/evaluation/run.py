@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Awaitable, Callable, Iterable
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -16,7 +16,7 @@ from clients.evaluation.queries import Query
 from clients.evaluation.readers import Reader
 from clients.wire.answers import InstantResult, LocalizeResult, parse_answer
 from clients.wire.rigs import RigImage
-from visloc.errors import InvalidInput, Overloaded, VislocError, WeightsError
+from visloc.errors import InvalidInput, Overloaded, VislocError, WeightsError, refuse
 from visloc.sequences.filling import TracedPose
 from visloc_api.words.options import LocalizeOptions
 
@@ -83,12 +83,14 @@ class QueryClient:
     Attributes:
         map_ref: ``id@version``.
         read: reads what is sent for a photo: its bytes or its features.
+        pairs: names of the mapping photos by the photo's name; None when the server retrieves them.
     """
 
     client: AsyncClient
     map_ref: str
     options: LocalizeOptions
     read: Reader
+    pairs: Mapping[str, tuple[str, ...]] | None = None
 
     async def localize(self, query: Query) -> Outcome:
         """Localize one photo.
@@ -101,10 +103,11 @@ class QueryClient:
         """
         started = time.perf_counter()
         try:
+            options = self._options([query])
             sent = await asyncio.to_thread(self.read, query)
             started = time.perf_counter()
             result = await _ask_patiently(
-                lambda: self.client.localize(sent, self.map_ref, query.camera, self.options)
+                lambda: self.client.localize(sent, self.map_ref, query.camera, options)
             )
         except VislocError as error:
             _raise_unless_of_one(error)
@@ -125,9 +128,10 @@ class QueryClient:
         result = None
         try:
             if images:
+                options = self._options(instant.photos)
                 result = await _ask_patiently(
                     lambda: self.client.localize_rig(
-                        images.values(), self.map_ref, instant.rig, self.options
+                        images.values(), self.map_ref, instant.rig, options
                     )
                 )
         except VislocError as error:
@@ -149,6 +153,14 @@ class QueryClient:
         )
         localized = result is not None and result.localized
         return InstantOutcome(photos, localized, result is not None, seconds)
+
+    def _options(self, queries: Sequence[Query]) -> LocalizeOptions:
+        if self.pairs is None:
+            return self.options
+        photos = dict.fromkeys(name for each in queries for name in self.pairs.get(each.name, ()))
+        if not photos:
+            raise refuse("pairs.no_photo", field=queries[0].name)
+        return LocalizeOptions(**self.options.given() | {"photos": list(photos)})
 
     async def _read_images(
         self, instant: QueryInstant

@@ -13,6 +13,7 @@ _MAX_WHOLE = 2**32 - 1  # whole numbers are uint32 on the wire
 _EXPECTED = {
     int: f"a whole number from 0 to {_MAX_WHOLE}",
     float: "a finite number",
+    tuple: "names of mapping photos, with commas between them on the command line",
     Mapping: "a number for each of some global descriptors, such as densevlad=1,localvlad=2",
 }
 
@@ -34,7 +35,9 @@ def checked_options(given: LocalizeOptions | Mapping[str, Any]) -> LocalizeOptio
 
 
 def options_from_texts(texts: Iterable[str]) -> LocalizeOptions:
-    """Parse ``NAME=VALUE``, as the command line has them; weights are ``NAME=NUMBER,...``.
+    """Parse ``NAME=VALUE``, as the command line has them.
+
+    Weights are ``NAME=NUMBER,...``, photos ``NAME,...``.
 
     Raises:
         InvalidInput: ``options.syntax``, ``options.NAME``, or as ``checked_options``.
@@ -53,6 +56,8 @@ def options_from_texts(texts: Iterable[str]) -> LocalizeOptions:
 
 
 def _can_be_sent(value: Any) -> bool:
+    if isinstance(value, list):
+        return len(value) > 0
     if isinstance(value, Mapping):
         return len(value) > 0 and all(map(_can_be_sent, value.values()))
     if isinstance(value, float):
@@ -76,4 +81,11 @@ def _weights(text: str) -> dict[str, float]:
     return weights
 
 
-_PARSERS: Mapping[type, Callable[[str], Any]] = {int: int, float: float, Mapping: _weights}
+def _names(text: str) -> list[str]:
+    return [name.strip() for name in text.split(",")]
+
+
+_PARSERS: Mapping[type, Callable[[str], Any]] = {
+    **{int: int, float: float, tuple: _names},
+    Mapping: _weights,
+}

@@ -174,9 +174,11 @@ def refuse_early(settings: BuildSettings, dataset: Dataset, photos: Sequence[Map
         known = known_positions(dataset, photos)
         if known is not None and known.anchor.geodetic is not None:
             _refuse_gravity_that_is_not_down(settings)
+    if settings.sfm.matches_dir is not None and not is_ready_made(settings.local_features):
+        raise refuse("sfm.matches", field="--matches-dir", got=settings.local_features)
     if settings.method == "sfm":
         others = tuple(name for name in settings.sfm.pairs if name != "retrieval")
-        if others or settings.sfm.pairs_file is not None:
+        if others or settings.sfm.pairs_file is not None or settings.sfm.matches_dir is not None:
             pairing = replace(settings.sfm, pairs=others)
             find_pairs(make_scene(dataset, photos, (), pairing), pairing)
 

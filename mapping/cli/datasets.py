@@ -1,4 +1,4 @@
-"""Commands about datasets: ``pairs``, ``calibrate-rig``, ``export-features`` and ``sample``."""
+"""Commands about datasets: pairs, rigs, features of ours and of others, the sample."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ from mapping.cli.build import CovisibleInOption
 from mapping.cli.display import ERR, print_rig, say, say_notes, say_peak_memory
 from mapping.cli.progress import StageProgress
 from mapping.cluster.storage import map_folder
+from mapping.datasets import READERS, write_parts
 from mapping.frames.rig_calibration import calibrate_rig, refuse_known_rigs, write_calibration
+from mapping.importers.hloc import import_features
 from mapping.maps.export_features import export_features
 from mapping.options import (
     DatasetArgument,
@@ -114,6 +116,46 @@ def export_features_command(
     for name in absent:
         ERR.print(f"absent, without features: {name}", markup=False, soft_wrap=True)
     say(f"kapture with features: {output}")
+
+
+def dataset(
+    name: Annotated[str, typer.Argument(metavar="SET", help=f"One of {', '.join(READERS)}.")],
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="The unpacked archive of one scene.")
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", help="Folder to make, with mapping/ and query/.")
+    ],
+) -> None:
+    """Make mapping and query datasets of a public data set, by its own split.
+
+    Photos are links to the archive, which must stay where it is.
+    """
+    for part, made in write_parts(name, folder, output).items():
+        say(f"{len(made.images)} photos: {output / part}")
+        say_notes(made.notes)
+
+
+def import_features_command(
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FILE.h5...", help="features.h5, global features and matches.h5 of hloc."
+        ),
+    ],
+    output: Annotated[Path, typer.Option("--output", help="Folder for --features-dir of a build.")],
+    type_name: Annotated[
+        str, typer.Option("--type", metavar="NAME", help="Name of the features: kapture:NAME.")
+    ] = "hloc",
+) -> None:
+    """Write features and matches of hloc in kapture's layout, for build and localize batch."""
+    written = import_features(files, output, type_name)
+    say(
+        f"{written['local']} photos with local features, {written['global']} with global ones, "
+        f"{written['pairs']} pairs with matches: {output}"
+    )
+    if written["pairs"]:
+        say(f"next: --matches-dir {output / 'reconstruction' / 'matches' / type_name}")
 
 
 def sample(

@@ -12,7 +12,14 @@ import typer
 from mapping.cli.acceptance import use
 from mapping.cli.build import build, import_
 from mapping.cli.capture import capture
-from mapping.cli.datasets import calibrate_rig_command, export_features_command, pairs, sample
+from mapping.cli.datasets import (
+    calibrate_rig_command,
+    dataset,
+    export_features_command,
+    import_features_command,
+    pairs,
+    sample,
+)
 from mapping.cli.display import ERR
 from mapping.cli.from_settings import from_settings
 from mapping.cli.maps import anchor, export, inspect, pack, upgrade, verify
@@ -43,6 +50,8 @@ COMMANDS: Mapping[str, Callable[..., None]] = {
     "split": split,
     "update": update,
     "export-features": export_features_command,
+    "dataset": dataset,
+    "import-features": import_features_command,
     "sample": sample,
 }
 

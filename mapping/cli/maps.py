@@ -25,7 +25,7 @@ from mapping.frames.georeference import (
     publish_anchored,
     read_correspondences,
 )
-from mapping.maps.export import EXPORTERS, export_map
+from mapping.maps.export import EXPORTERS, Queries, export_map
 from mapping.maps.packing import write_packed
 from mapping.maps.upgrading import lacking, upgrade_map
 from mapping.options import Gravity, MapArgument, MapsDirOption, WeightsDirOption
@@ -173,12 +173,30 @@ def export(
     format_name: Annotated[
         str, typer.Option("--format", help=f"One of {', '.join(EXPORTERS)}.")
     ] = "colmap",
+    queries: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DATASET",
+            help="For colmap: photos to match with the map and to add to database.db, for COLMAP's "
+            "image_registrator.",
+        ),
+    ] = None,
     maps_dir: MapsDirOption = Path("maps"),
+    weights_dir: WeightsDirOption = None,
 ) -> None:
     """Write a map for other tools: a COLMAP model, a kapture dataset, or a PLY point cloud."""
     opened = open_map(map_folder(map_ref, maps_dir))
+    added = None
+    if queries is not None:
+        extractor = make_local_features(
+            opened.manifest.local_features.fingerprint.name, weights_dir
+        )
+        localizer = Localizer(
+            opened, extractor, partial(make_global_descriptor, weights_dir=weights_dir)
+        )
+        added = Queries(read_dataset(queries), localizer)
     with _step("export"):
-        notes = export_map(opened, output, format_name)
+        notes = export_map(opened, output, format_name, added)
     say(f"{format_name}: {output}")
     say_notes(notes)
 

@@ -12,6 +12,12 @@ import PIL.Image  # noqa: F401  Pillow saves PNGs only when it was imported befo
 import pycolmap
 from numpy.typing import NDArray
 
+from mapping.maps.colmap_database import (
+    DatabasePhoto,
+    matches_of_tracks,
+    write_colmap_database,
+)
+from mapping.maps.colmap_queries import match_queries
 from mapping.stages.imported_points import ImportedPoints, read_imported_points
 from mapping.stages.landmarks import Observations, View, reprojection_errors
 from mapping.stages.outputs import complete_output
@@ -30,13 +36,28 @@ from visloc.kapture import (
     write_local_features,
     write_reconstruction,
 )
+from visloc.localization.localizer import Localizer
 from visloc.pose.colmap import colmap_camera
 
 _NO_ERROR = -1.0  # COLMAP's word for a point whose error is not known
 _IMPORTED = "imported"  # type of the keypoints of the reconstruction that a map came from
 
 
-def export_map(opened: Map, output: Path, format_name: str) -> tuple[str, ...]:
+@dataclass(frozen=True, slots=True, eq=False)
+class Queries:
+    """Photos that a COLMAP database gets besides those of the map.
+
+    Attributes:
+        localizer: of the map; it finds and matches their features.
+    """
+
+    dataset: Dataset
+    localizer: Localizer
+
+
+def export_map(
+    opened: Map, output: Path, format_name: str, queries: Queries | None = None
+) -> tuple[str, ...]:
     """Write a map for other tools; nothing is left if it fails.
 
     Coordinates are those of the world, with the map's origin added, and names of photos are those
@@ -48,23 +69,33 @@ def export_map(opened: Map, output: Path, format_name: str) -> tuple[str, ...]:
     Args:
         opened: the map.
         output: a folder to make, for ``ply`` a file; it must not exist.
-        format_name: a key of ``EXPORTERS``: ``colmap`` is a binary model of one rig per camera;
+        format_name: a key of ``EXPORTERS``: ``colmap`` is a binary model of one rig per camera,
+            with ``database.db`` in the schema of COLMAP 3.8;
             ``kapture`` a kapture 1.1 dataset with keypoints, descriptors as the map has them in 8
             bits, points and global descriptors; ``ply`` points in binary, double precision.
+        queries: photos to match and to add to the database; for ``colmap`` only.
 
     Returns:
         Notes on what is not as in the map, one sentence each.
 
     Raises:
-        InvalidInput: ``export.unknown_format``.
+        InvalidInput: ``export.unknown_format``; ``export.queries`` for another format, or for a map
+            of an imported reconstruction whose points are not those that queries are matched with.
         Conflict: ``export.exists``.
         DatasetError: ``kapture.field`` for a name that kapture cannot hold.
     """
     export = EXPORTERS.get(format_name)
     if export is None:
         raise refuse("export.unknown_format", field="--format", expected=EXPORTERS, got=format_name)
+    if queries is not None and (
+        format_name != "colmap" or read_imported_points(opened) is not None
+    ):
+        raise refuse("export.queries", field="--queries", got=f"{format_name} of {opened.ref}")
     with complete_output(output, "export.exists") as partial:
-        return export(opened, partial)
+        notes = export(opened, partial)
+        if format_name == "colmap":
+            notes += _write_database(opened, partial / "database.db", queries)
+        return notes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,6 +188,28 @@ def _export_colmap(opened: Map, output: Path) -> tuple[str, ...]:
     output.mkdir()
     model.write_binary(output)
     return ()
+
+
+def _write_database(opened: Map, path: Path, queries: Queries | None) -> tuple[str, ...]:
+    exported = _model(opened)
+    is_sift = opened.manifest.local_features.fingerprint.name == "sift" and exported.described
+    scale = np.float32(opened.manifest.local_features.descriptor_scale)
+    photos = [
+        DatabasePhoto(
+            *(record.name, record.camera, opened.cameras[record.camera], exported.keypoints[row]),
+            opened.observations(row)[1] * scale if is_sift else None,
+            Pose.from_quaternion(opened.image_poses[row][:4], opened.image_poses[row][4:]),
+        )
+        for row, record in enumerate(opened.images)
+    ]
+    matches, notes = matches_of_tracks(exported.observations), tuple[str, ...]()
+    if queries is not None:
+        added, theirs, notes = match_queries(opened, queries.localizer, queries.dataset)
+        photos, matches = photos + added, matches | theirs
+    write_colmap_database(path, photos, opened.cameras, matches)
+    if is_sift:
+        return notes
+    return (*notes, "the database has no descriptors: COLMAP 3.8 has a place for SIFT's only")
 
 
 def _export_kapture(opened: Map, output: Path) -> tuple[str, ...]:

@@ -1,11 +1,14 @@
 """The matching stages: mutual nearest neighbours of paired photos, then geometric verification.
 
+Matches of another program take the place of the nearest neighbours, and are verified likewise.
+
 With known poses, a match must fit their epipolar geometry. Without, the two-view geometry of the
 pair is estimated (``mapping.methods.two_views``).
 """
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -19,7 +22,9 @@ from mapping.stages.landmarks import View
 from mapping.stages.local_features import LocalFeaturesSource
 from mapping.stages.photos import MappingPhoto
 from mapping.stages.work_folder import Item, WorkFolder, key_of
+from visloc.errors import refuse
 from visloc.geometry import Camera, Pose
+from visloc.kapture.matches import MatchFiles, match_file
 from visloc.matching.correspondences import mutual_nearest_neighbours
 from visloc.matching.products import round_descriptors
 from visloc.matching.verification import epipolar_errors
@@ -84,7 +89,7 @@ def find_fixed(
         Masks by sensor, of those that have such things.
     """
     partners = [group for _, _, group in _groups(photos, pairs)]
-    task = _MatchTask(context.work, context.features, verification)
+    task = _MatchTask(context.work, context.features, verification, context.matches)
     context.run("matches", task.match_and_tally, partners)
     tallies: dict[str, Tally] = {}
     for group in partners:
@@ -109,7 +114,7 @@ def match_pairs(
     found_groups = _groups(photos, pairs)
     groups = [(first, seconds) for first, seconds, _ in found_groups]
     partners = [group for _, _, group in found_groups]
-    task = _MatchTask(context.work, context.features, verification)
+    task = _MatchTask(context.work, context.features, verification, context.matches)
     # Usually, what is fixed was looked for among the same matches.
     missing = [group for group in partners if not context.work.has(task.matches_key(group))]
     if missing:
@@ -144,13 +149,16 @@ class _MatchTask:
     work: WorkFolder
     features: LocalFeaturesSource
     verification: Verification
+    given: MatchFiles | None = None
 
     def matches_key(self, group: _Partners) -> str:
+        told = {} if self.given is None else {"given": self._hash_of_given(group)}
         return key_of(
             "matches",
             _REVISION["matches"],
             photo=self.features.key(group.photo),
             partners=[self.features.key(partner) for partner in group.partners],
+            **told,
         )
 
     def tally_key(self, group: _Partners) -> str:
@@ -192,6 +200,8 @@ class _MatchTask:
 
     def match(self, group: _Partners) -> None:
         def compute() -> Item:
+            if self.given is not None:
+                return _item([self._given(group.photo, partner) for partner in group.partners])
             own = round_descriptors(self.features.read(group.photo).descriptors)
             found = []
             for partner in group.partners:
@@ -202,6 +212,29 @@ class _MatchTask:
 
         if not self.work.has(self.matches_key(group)):
             self.work.get(self.matches_key(group), compute)
+
+    def _hash_of_given(self, group: _Partners) -> str:
+        digest = hashlib.sha256()
+        for partner in group.partners:
+            rows = self._given(group.photo, partner)
+            digest.update(len(rows).to_bytes(8, "little") + rows.tobytes())
+        return digest.hexdigest()
+
+    def _given(self, photo: MappingPhoto, partner: MappingPhoto) -> NDArray[np.uint32]:
+        """Matches of another program; none for a pair that it left out."""
+        assert self.given is not None
+        rows = self.given.read(photo.name, partner.name)
+        if rows is None:
+            return np.empty((0, 2), np.uint32)
+        counts = [len(self.features.read(each).keypoints) for each in (photo, partner)]
+        if (rows >= counts).any():
+            raise refuse(
+                "kapture.match_values",
+                field=self.given.label(match_file(photo.name, partner.name)),
+                expected=f"rows of {counts[0]} and {counts[1]} keypoints",
+                got=", ".join(map(str, rows.max(axis=0).tolist())),
+            )
+        return rows.astype(np.uint32)
 
     def match_and_tally(self, group: _Partners) -> None:
         self.match(group)

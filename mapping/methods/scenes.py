@@ -8,22 +8,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.methods.sfm_settings import SfmSettings
-from mapping.pairing import Pairs, Scene, pair_photos, read_pairs
+from mapping.pairing import Pairs, Scene, matched_pairs, pair_photos, read_pairs
 from mapping.stages.photos import MappingPhoto
 from visloc.archive import GlobalFeatures, Map
 from visloc.errors import DatasetError, refuse
 from visloc.kapture import Dataset, read_reconstruction
+from visloc.kapture.matches import open_matches
 
 
 def find_pairs(scene: Scene, settings: SfmSettings) -> Pairs:
-    """Return the pairs of the pairs file, or else of the pairings.
+    """Return the pairs of the pairs file, of the given matches, or else of the pairings.
 
     Raises:
         InvalidInput: ``pairs.none``, and what the pairings raise.
-        DatasetError: what ``read_pairs`` raises.
+        DatasetError: what ``read_pairs`` and ``open_matches`` raise.
     """
     if settings.pairs_file is not None:
         pairs = read_pairs(settings.pairs_file, scene)
+    elif settings.matches_dir is not None:
+        pairs = matched_pairs(open_matches(settings.matches_dir), scene)
     else:
         pairs = pair_photos(scene, settings.pairs, settings.pairing)
     if len(pairs) == 0:

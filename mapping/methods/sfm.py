@@ -41,6 +41,7 @@ from visloc.archive import Anchor, GlobalFeatures
 from visloc.errors import InvalidInput
 from visloc.geometry import Pose, Similarity
 from visloc.kapture import Dataset
+from visloc.kapture.matches import open_matches
 
 # When more of the photos have no place, what is missing may be most of the place.
 _MANY_ABSENT = 0.4
@@ -73,6 +74,8 @@ def landmarks_from_matches(
         DatasetError: with the file that is wrong.
     """
     config = MAPPER_CONFIGS[settings.mapper]
+    if settings.matches_dir is not None:
+        context = replace(context, matches=open_matches(settings.matches_dir))
     scene = make_scene(dataset, photos, global_features, settings)
     with one_step(context.progress, "pairs"):
         pairs = find_pairs(scene, settings)

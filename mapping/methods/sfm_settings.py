@@ -41,6 +41,13 @@ class SfmSettings:
         Path | None,
         _option(help="File with pairs to match instead of --pairs, such as pairs.txt of a map."),
     ] = None
+    matches_dir: Annotated[
+        Path | None,
+        _option(
+            help="Folder of another program's matches of ready-made features, in kapture's layout "
+            "(reconstruction/matches/TYPE). Without --pairs-file, its pairs are the pairs."
+        ),
+    ] = None
     covisible_in: Map | None = None
     mapper: Annotated[
         str,
@@ -75,8 +82,12 @@ class SfmSettings:
             "refine": list(self.refine),
             "poses": self.poses,
         }
+        if self.matches_dir is not None:
+            used["matches"] = "given"
         if self.pairs_file is not None:
             return {"pairs_file_sha256": sha256_of(self.pairs_file), **used}
+        if self.matches_dir is not None:
+            return used
         pairing = self.pairing
         if "distance" in self.pairs:
             used |= {"max_distance": pairing.max_distance, "max_angle_deg": pairing.max_angle_deg}

@@ -9,7 +9,7 @@ import numpy as np
 from mapping.pairing.covisibility import pair_by_covisibility
 from mapping.pairing.distance import pair_by_distance
 from mapping.pairing.exhaustive import pair_exhaustively
-from mapping.pairing.files import read_pairs, write_pairs
+from mapping.pairing.files import matched_pairs, read_pairs, write_pairs
 from mapping.pairing.frustum import pair_by_frustum
 from mapping.pairing.ranking import unite
 from mapping.pairing.retrieval import pair_by_retrieval
@@ -75,6 +75,7 @@ __all__ = [
     "Pairing",
     "Pairs",
     "Scene",
+    "matched_pairs",
     "pair_photos",
     "read_pairs",
     "write_pairs",

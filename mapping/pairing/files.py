@@ -1,4 +1,4 @@
-"""kapture's pairs files: which photo to match with which, in text."""
+"""Pairs files of a dataset's photos: which photo to match with which."""
 
 from __future__ import annotations
 
@@ -9,11 +9,9 @@ import numpy as np
 
 from mapping.pairing.ranking import unite
 from mapping.pairing.scene import Pairs, Scene
-from visloc.kapture.table import Table
+from visloc.kapture.matches import MatchFiles
+from visloc.kapture.pairs import PairRow, read_pair_rows, write_pair_rows
 from visloc.kapture.text import relative_path
-from visloc.kapture.writer import write_atomically
-
-_HEADER = "# query_image, map_image, score"
 
 
 def write_pairs(path: Path, scene: Scene, pairs: Pairs) -> None:
@@ -21,42 +19,49 @@ def write_pairs(path: Path, scene: Scene, pairs: Pairs) -> None:
 
     Numbers are written exactly.
     """
-    lines = [_HEADER]
-    lines += [
-        f"{scene.names[first]}, {scene.names[second]}, {score!r}"
-        for (first, second), score in zip(pairs.rows.tolist(), pairs.scores.tolist(), strict=True)
-    ]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, ("\n".join(lines) + "\n").encode("utf-8"))
+    listed = zip(pairs.rows.tolist(), pairs.scores.tolist(), strict=True)
+    write_pair_rows(
+        path,
+        ((scene.names[first], scene.names[second], score) for (first, second), score in listed),
+    )
 
 
 def read_pairs(path: Path, scene: Scene) -> Pairs:
-    """Read lines ``name, name`` or ``name, name, score``; a pair without a score has score 1.
+    """Read kapture's or hloc's pairs; a pair without a score has score 1.
 
-    A repeated pair, in either order, counts once with its best score. Comments and blank lines are
-    ignored.
+    A repeated pair, in either order, counts once with its best score.
 
     Raises:
-        DatasetError: with file and line; ``kapture.unreadable``, ``kapture.encoding``,
-            ``pairs.column_count``, ``pairs.unknown_photo``, ``pairs.same_photo`` or
-            ``kapture.number`` for a score that is not a finite number.
+        DatasetError: with file and line; ``pairs.unknown_photo``, ``pairs.same_photo``, and as
+            ``read_pair_rows``.
     """
     row_of = {name: row for row, name in enumerate(scene.names)}
-    table = Table(Path(), str(path), None)  # so that errors name the whole path
     first, second, scores = array("q"), array("q"), array("d")
-    for fields in table:
-        if len(fields) not in (2, 3):
-            raise table.error("pairs.column_count", got=len(fields))
-        rows = [_row(row_of, name, table) for name in fields[:2]]
+    for pair in read_pair_rows(path):
+        rows = [_row(row_of, name, pair) for name in pair[:2]]
         if rows[0] == rows[1]:
-            raise table.error("pairs.same_photo", got=fields[0])
+            raise pair.table.error("pairs.same_photo", got=pair.first)
         first.append(rows[0])
         second.append(rows[1])
-        scores.extend(table.numbers(fields[2:]) or [1.0])
+        scores.append(1.0 if pair.score is None else pair.score)
     return unite([(np.array(first), np.array(second), np.array(scores))])
 
 
-def _row(row_of: dict[str, int], name: str, table: Table) -> int:
+def matched_pairs(matches: MatchFiles, scene: Scene) -> Pairs:
+    """Return the pairs of the scene's photos that have a file of matches, each with score 1."""
+    row_of = {name: row for row, name in enumerate(scene.names)}
+    rows = np.array(
+        [
+            (row_of[first], row_of[second])
+            for first, second in matches.pairs()
+            if first in row_of and second in row_of and first != second
+        ],
+        dtype=np.int64,
+    ).reshape(-1, 2)
+    return unite([(rows[:, 0], rows[:, 1], np.ones(len(rows)))])
+
+
+def _row(row_of: dict[str, int], name: str, pair: PairRow) -> int:
     row = row_of.get(name)
     if row is None:
         try:
@@ -64,5 +69,5 @@ def _row(row_of: dict[str, int], name: str, table: Table) -> int:
         except ValueError:
             row = None
     if row is None:
-        raise table.error("pairs.unknown_photo", got=name)
+        raise pair.table.error("pairs.unknown_photo", got=name)
     return row

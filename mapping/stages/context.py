@@ -12,19 +12,25 @@ from mapping.progress import Progress
 from mapping.stages.local_features import LocalFeaturesSource
 from mapping.stages.networks import Networks
 from mapping.stages.work_folder import WorkFolder
+from visloc.kapture.matches import MatchFiles
 
 T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
 class BuildContext:
-    """The shared inputs of all stages of a build or an update."""
+    """The shared inputs of all stages of a build or an update.
+
+    Attributes:
+        matches: of another program, instead of our own; they name rows of ``features``.
+    """
 
     work: WorkFolder
     features: LocalFeaturesSource
     networks: Networks
     workers: Executor
     progress: Progress
+    matches: MatchFiles | None = None
 
     def run(self, stage: str, task: Callable[[T], object], items: Sequence[T]) -> None:
         """Do a task for every item, as one stage.

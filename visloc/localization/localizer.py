@@ -26,6 +26,7 @@ from visloc.localization.constraints import Constraints, MapGeometry
 from visloc.localization.evidence import Shown
 from visloc.localization.feature_cache import FeatureCache, find_features
 from visloc.localization.fingerprints import check_fingerprint
+from visloc.localization.named_photos import NamedPhotos
 from visloc.localization.query_camera import query_resolution, resolve_camera
 from visloc.localization.query_features import (
     checked_global_descriptors,
@@ -54,7 +55,7 @@ from visloc.options import Fallback, LocalizeOptions, Matcher, ReadAs
 from visloc.priors import NO_PRIORS, Priors
 from visloc.retrieval.excluded import excluded_photos
 from visloc.retrieval.fusion import LateFusion, chosen_fusion
-from visloc.retrieval.index import Retrieved, retrieve
+from visloc.retrieval.index import Retrieved, compare, retrieve
 from visloc.timing import timed
 from visloc.types import (
     Answer,
@@ -97,7 +98,7 @@ class _Features:
 
 
 class Localizer:
-    """Localizes photos, or the features of photos, in one map. Safe to use from several threads.
+    """Localizes photos, or features of photos, in one map. Safe to use from several threads.
 
     Args:
         opened: the map.
@@ -134,6 +135,7 @@ class Localizer:
                 descriptor = make_descriptor(name)
                 check_fingerprint(record.fingerprint, descriptor.fingerprint, opened.ref)
                 self._descriptors[name] = descriptor
+        self._named = NamedPhotos(opened)
         self.geometry = MapGeometry(opened)
         self._coarse = CoarsePoses(self.geometry)
         self.turns = (
@@ -169,11 +171,13 @@ class Localizer:
 
         Raises:
             InvalidInput: ``options.fusion_weights`` of global descriptors that the map does not
-                have; ``options.matcher`` when there is none for its local features;
-                ``options.solver`` for a rig of several cameras with ``registration``.
+                have; ``options.photos`` that it does not have; ``options.matcher`` when there is
+                none for its local features; ``options.solver`` for a rig of several cameras with
+                ``registration``.
             WeightsError: when the weights of the matcher are missing or damaged.
         """
         self._fusion(options)
+        self._named.rows(options.photos or ())
         check_solver(options, num_cameras)
         if options.matcher is Matcher.LIGHTGLUE:
             self._make_matcher(self.map.manifest.local_features.fingerprint.name)
@@ -374,7 +378,10 @@ class Localizer:
             }
         with timed(seconds, "retrieval"):
             index, weights = self.map.global_descriptors, constraints.photo_weights
-            retrieved = retrieve(query, index, options.top_k, weights, fusion)
+            if options.photos is None:
+                retrieved = retrieve(query, index, options.top_k, weights, fusion)
+            else:
+                retrieved = compare(query, index, self._named.rows(options.photos), weights, fusion)
             elsewhere = excluded_photos(query, index, retrieved, weights, fusion)
         if len(retrieved.images) == 0:
             why = "the map has no photo in the area that the priors allow"

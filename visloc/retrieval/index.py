@@ -96,6 +96,29 @@ def retrieve(
     )
 
 
+def compare(
+    query: Mapping[str, NDArray[np.float32]],
+    index: Mapping[str, GlobalRows],
+    photos: NDArray[np.int64],
+    photo_weights: NDArray[np.float64] | None = None,
+    fusion: LateFusion = EQUAL_GHARM,
+) -> Retrieved:
+    """Compare a query with photos that the caller chose, in the caller's order.
+
+    Args:
+        query: as for ``retrieve``.
+        index: as for ``retrieve``.
+        photos: (k,) rows of ``index``, best first; those that ``photo_weights`` exclude are left
+            out.
+        photo_weights: as for ``retrieve``.
+        fusion: as for ``retrieve``.
+    """
+    if photo_weights is not None:
+        photos = photos[photo_weights[photos] > 0]
+    cosines = _cosines(query, {name: index[name] for name in fusion.counted(index)}, photos)
+    return Retrieved(photos, fusion.scores(cosines), cosines)
+
+
 def _proposed(
     query: Mapping[str, NDArray[np.float32]],
     index: Mapping[str, GlobalRows],

@@ -81,6 +81,7 @@ class LocalizeOptions(_message.Message):
 
     PRESET_FIELD_NUMBER: _builtins.int
     TOP_K_FIELD_NUMBER: _builtins.int
+    PHOTOS_FIELD_NUMBER: _builtins.int
     MAX_ERROR_PX_FIELD_NUMBER: _builtins.int
     MIN_INLIERS_FIELD_NUMBER: _builtins.int
     MIN_INLIER_RATIO_FIELD_NUMBER: _builtins.int
@@ -126,6 +127,10 @@ class LocalizeOptions(_message.Message):
     fallback: _builtins.str
     """What a refused photo on its own gets: none, or coarse, the pose that retrieval alone tells."""
     @_builtins.property
+    def photos(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
+        """Mapping photos to match against, best first. When empty, they are retrieved."""
+
+    @_builtins.property
     def fusion_weights(self) -> _containers.ScalarMap[_builtins.str, _builtins.float]:
         """Weight by global descriptor; descriptors without a weight are not used. When empty, the map's
         weights are used.
@@ -136,6 +141,7 @@ class LocalizeOptions(_message.Message):
         *,
         preset: _builtins.str | None = ...,
         top_k: _builtins.int | None = ...,
+        photos: _abc.Iterable[_builtins.str] | None = ...,
         max_error_px: _builtins.float | None = ...,
         min_inliers: _builtins.int | None = ...,
         min_inlier_ratio: _builtins.float | None = ...,
@@ -152,7 +158,7 @@ class LocalizeOptions(_message.Message):
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["_extraction", b"_extraction", "_fallback", b"_fallback", "_fusion", b"_fusion", "_fusion_parameter", b"_fusion_parameter", "_matcher", b"_matcher", "_max_error_px", b"_max_error_px", "_min_inlier_ratio", b"_min_inlier_ratio", "_min_inliers", b"_min_inliers", "_min_probability", b"_min_probability", "_preset", b"_preset", "_read_as", b"_read_as", "_seed", b"_seed", "_solver", b"_solver", "_top_k", b"_top_k", "extraction", b"extraction", "fallback", b"fallback", "fusion", b"fusion", "fusion_parameter", b"fusion_parameter", "matcher", b"matcher", "max_error_px", b"max_error_px", "min_inlier_ratio", b"min_inlier_ratio", "min_inliers", b"min_inliers", "min_probability", b"min_probability", "preset", b"preset", "read_as", b"read_as", "seed", b"seed", "solver", b"solver", "top_k", b"top_k"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_extraction", b"_extraction", "_fallback", b"_fallback", "_fusion", b"_fusion", "_fusion_parameter", b"_fusion_parameter", "_matcher", b"_matcher", "_max_error_px", b"_max_error_px", "_min_inlier_ratio", b"_min_inlier_ratio", "_min_inliers", b"_min_inliers", "_min_probability", b"_min_probability", "_preset", b"_preset", "_read_as", b"_read_as", "_seed", b"_seed", "_solver", b"_solver", "_top_k", b"_top_k", "extraction", b"extraction", "fallback", b"fallback", "fusion", b"fusion", "fusion_parameter", b"fusion_parameter", "fusion_weights", b"fusion_weights", "matcher", b"matcher", "max_error_px", b"max_error_px", "min_inlier_ratio", b"min_inlier_ratio", "min_inliers", b"min_inliers", "min_probability", b"min_probability", "preset", b"preset", "read_as", b"read_as", "seed", b"seed", "solver", b"solver", "top_k", b"top_k"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_extraction", b"_extraction", "_fallback", b"_fallback", "_fusion", b"_fusion", "_fusion_parameter", b"_fusion_parameter", "_matcher", b"_matcher", "_max_error_px", b"_max_error_px", "_min_inlier_ratio", b"_min_inlier_ratio", "_min_inliers", b"_min_inliers", "_min_probability", b"_min_probability", "_preset", b"_preset", "_read_as", b"_read_as", "_seed", b"_seed", "_solver", b"_solver", "_top_k", b"_top_k", "extraction", b"extraction", "fallback", b"fallback", "fusion", b"fusion", "fusion_parameter", b"fusion_parameter", "fusion_weights", b"fusion_weights", "matcher", b"matcher", "max_error_px", b"max_error_px", "min_inlier_ratio", b"min_inlier_ratio", "min_inliers", b"min_inliers", "min_probability", b"min_probability", "photos", b"photos", "preset", b"preset", "read_as", b"read_as", "seed", b"seed", "solver", b"solver", "top_k", b"top_k"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__extraction: _TypeAlias = _typing.Literal["extraction"]  # noqa: Y015
     _WhichOneofArgType__extraction: _TypeAlias = _typing.Literal["_extraction", b"_extraction"]  # noqa: Y015

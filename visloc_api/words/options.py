@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from typing import Annotated, Any, ClassVar, get_args, get_type_hints
 
@@ -16,6 +16,8 @@ from visloc_api.words.message import IncomingMessage, converted
 # More global descriptors than any map has, and longer names.
 _MAX_WEIGHTS = 16
 _MAX_NAME = 100
+# Longer than any path of a photo.
+_MAX_PATH = 4096
 _MESSAGES = {
     "read_as": "the orientation is unknown",
     "extraction": "the effort is unknown",
@@ -33,7 +35,7 @@ def _kind_of(hint: Any) -> type:
     return found
 
 
-# The class of each option: int, float, str, Mapping, or an enumeration of texts.
+# The class of each option: int, float, str, tuple, Mapping, or an enumeration of texts.
 KINDS: Mapping[str, type] = {
     name: _kind_of(hint) for name, hint in get_type_hints(visloc.options.LocalizeOptions).items()
 }
@@ -67,6 +69,27 @@ def _check_names(value: object) -> object:
                     field="fusion_weights",
                     expected=f"a text of 1 to {_MAX_NAME} characters",
                     got=f"{len(name)} characters" if isinstance(name, str) else type(name).__name__,
+                )
+    return value
+
+
+def _check_photos(value: object) -> object:
+    """Refuse too many or too long names before anything is done with them."""
+    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
+        if len(value) > visloc.options.MAX_PHOTOS:
+            raise refuse(
+                "options.photos",
+                field="photos",
+                expected=f"at most {visloc.options.MAX_PHOTOS} names",
+                got=len(value),
+            )
+        for name in value:
+            if isinstance(name, str) and len(name) > _MAX_PATH:
+                raise refuse(
+                    "options.photos",
+                    field="photos",
+                    expected=f"names of at most {_MAX_PATH} characters",
+                    got=f"{len(name)} characters",
                 )
     return value
 
@@ -108,6 +131,7 @@ class LocalizeOptions(IncomingMessage):
 
     preset: Annotated[str | None, _option("preset")] = None
     top_k: Annotated[int | None, _option("top_k")] = None
+    photos: Annotated[list[str] | None, converted(_check_photos), _option("photos")] = None
     max_error_px: Annotated[float | None, _option("max_error_px")] = None
     min_inliers: Annotated[int | None, _option("min_inliers")] = None
     min_inlier_ratio: Annotated[float | None, _option("min_inlier_ratio")] = None
@@ -137,6 +161,8 @@ class LocalizeOptions(IncomingMessage):
                     got=given[name],
                 )
             given[name] = KINDS[name](given[name])
+        if "photos" in given:
+            given["photos"] = tuple(given["photos"])
         return visloc.options.LocalizeOptions(**given)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from clients.evaluation.queries import read_queries
-from visloc.errors import DatasetError
+from visloc.errors import DatasetError, InvalidInput
 from visloc.geometry import Camera
 
 
@@ -40,6 +40,32 @@ def test_a_list_gives_names_paths_and_cameras_in_its_order(
     assert queries[1].camera is None
     assert queries[2].camera is None
     assert all(query.truth is None for query in queries)
+
+
+def test_lists_of_a_pattern_are_one_with_names_below_the_image_root(tmp_path: Path) -> None:
+    (tmp_path / "queries").mkdir()
+    for name, line in (
+        ("night", "query/n.jpg PINHOLE 640 480 5 5 3 2\n"),
+        ("day", "query/d.jpg\n"),
+    ):
+        (tmp_path / "queries" / f"{name}_with_intrinsics.txt").write_text(line)
+    (tmp_path / "queries" / "other.txt").write_text("not a list\n")
+    root = tmp_path / "images_upright"
+
+    queries = read_queries(tmp_path / "queries" / "*_with_intrinsics.txt", image_root=root)
+
+    assert [photo.name for photo in queries.photos] == ["query/d.jpg", "query/n.jpg"]
+    assert [photo.path for photo in queries.photos] == [root / "query/d.jpg", root / "query/n.jpg"]
+    (tmp_path / "queries" / "z_with_intrinsics.txt").write_text("query/d.jpg\n")
+    with pytest.raises(DatasetError) as caught:
+        read_queries(tmp_path / "queries" / "*_with_intrinsics.txt")
+    assert caught.value.code == "list.duplicate"
+
+
+def test_a_kapture_folder_has_no_image_root(make_dataset: Callable[..., Path]) -> None:
+    with pytest.raises(InvalidInput) as caught:
+        read_queries(make_dataset({"a.jpg": b""}), image_root=Path())
+    assert caught.value.code == "queries.image_root"
 
 
 @pytest.mark.parametrize(

@@ -65,6 +65,15 @@ def test_other_peoples_files_are_read(scene: Scene, path: Path) -> None:
     assert pairs.scores.tolist() == [1.0, 3.0, 0.2]
 
 
+def test_hlocs_files_are_read(scene: Scene, path: Path) -> None:
+    path.write_text("left/1.jpg left/2.jpg\nleft/2.jpg\tgröße.jpg 0.25\n")
+
+    pairs = read_pairs(path, scene)
+
+    assert pairs.rows.tolist() == [[0, 1], [1, 3]]
+    assert pairs.scores.tolist() == [1.0, 0.25]
+
+
 def test_a_pair_given_again_in_either_order_keeps_its_best_score(scene: Scene, path: Path) -> None:
     path.write_text(
         "left/1.jpg, left/2.jpg, 0.3\nleft/2.jpg, left/1.jpg, 0.7\nleft/1.jpg, left/2.jpg, 0.5\n"
@@ -85,7 +94,9 @@ def test_a_pair_given_again_in_either_order_keeps_its_best_score(scene: Scene, p
         ("/etc/passwd, left/2.jpg, 1", "pairs.unknown_photo"),
         ("../left/1.jpg, left/2.jpg, 1", "pairs.unknown_photo"),
         ("left/1.jpg", "pairs.column_count"),
-        ("left/1.jpg left/2.jpg 0.5", "pairs.column_count"),
+        ("left/1.jpg left/2.jpg 0.5 1", "pairs.column_count"),
+        ("left/1.jpg left/2.jpg x", "kapture.number"),
+        ("left/1.jpg left/9.jpg", "pairs.unknown_photo"),
         ("left/1.jpg, left/2.jpg, 1, 2", "pairs.column_count"),
         ("left/1.jpg, left/1.jpg, 1", "pairs.same_photo"),
         ("left/1.jpg, left/./1.jpg, 1", "pairs.same_photo"),

@@ -504,14 +504,14 @@ def test_messages_say_the_same_as_json() -> None:
             }
         ),
         images=[pb2.RigImage(sensor="left", image=b"photo", timestamp=0)],
-        options=pb2.LocalizeOptions(top_k=3, fusion="mean", fusion_weights={"a": 2}),
+        options=pb2.LocalizeOptions(photos=["b"], fusion="mean", fusion_weights={"a": 2}),
         priors=pb2.Priors(height=pb2.HeightBand(min=0, max=1)),
     )
 
     job = rig_job_of(request, LIMITS)
 
     assert (job.maps, job.timestamp) == (("a", "b"), 0)
-    assert job.options == CoreOptions(top_k=3, fusion=Fusion.MEAN, fusion_weights={"a": 2})
+    assert job.options == CoreOptions(photos=("b",), fusion=Fusion.MEAN, fusion_weights={"a": 2})
     assert (job.images[0].query, job.images[0].camera) == (b"photo", None)
     assert job.priors.height is not None
     assert (job.priors.height.min, job.priors.pose) == (0, None)

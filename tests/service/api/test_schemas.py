@@ -41,6 +41,7 @@ def test_a_full_request_becomes_the_job_that_it_says() -> None:
     options = {
         "preset": "config1",
         "top_k": 5,
+        "photos": ["b.jpg", "a.jpg"],
         "max_error_px": 8,
         "min_inliers": 12,
         "min_inlier_ratio": 0.5,
@@ -62,7 +63,18 @@ def test_a_full_request_becomes_the_job_that_it_says() -> None:
     assert job.images[0].camera is not None
     assert job.images[0].camera.params == (525.0, 525.5, 320.0, 240.0)
     assert job.options == CoreOptions(
-        *("config1", 5, 8.0, 12, 0.5, 0.8, ReadAs.UPRIGHT, Extraction.FAST, Fusion.MEAN),
+        *(
+            "config1",
+            5,
+            ("b.jpg", "a.jpg"),
+            8.0,
+            12,
+            0.5,
+            0.8,
+            ReadAs.UPRIGHT,
+            Extraction.FAST,
+            Fusion.MEAN,
+        ),
         fusion_weights={"densevlad": 1.0, "kapture:AP-GeM": 0.5},
         matcher=Matcher.RATIO,
         solver=Solver.POSELIB,
@@ -105,8 +117,8 @@ def test_options_may_be_text() -> None:
             request(options={"topk": 1}),
             "request.unknown_field",
             "options.topk",
-            "one of preset, top_k, max_error_px, min_inliers, min_inlier_ratio, min_probability, "
-            "read_as, extraction, fusion, fusion_weights, matcher, solver, seed",
+            "one of preset, top_k, photos, max_error_px, min_inliers, min_inlier_ratio, "
+            "min_probability, read_as, extraction, fusion, fusion_weights, matcher, solver, seed",
         ),
         (
             request(camera=CAMERA | {"fov": 60}),
@@ -174,6 +186,17 @@ def test_options_may_be_text() -> None:
                 (dict.fromkeys(map(str, range(17)), 1), "options.fusion_weights", "", "at most 16"),
                 ({"": 1}, "options.fusion_weights", "", "a text of 1 to 100 characters"),
                 ({"a" * 101: 1}, "options.fusion_weights", "", "a text of 1 to 100 characters"),
+            ]
+        ),
+        *(
+            (request(options={"photos": given}), code, f"options.photos{below}", expected)
+            for given, code, below, expected in [
+                ("a.jpg", "request.invalid", "", None),
+                ([1], "request.invalid", "[0]", None),
+                ([], "options.photos", "", "1 to 1000 names, each once"),
+                (["a", "a"], "options.photos", "", "1 to 1000 names, each once"),
+                (["a"] * 1001, "options.photos", "", "at most 1000 names"),
+                (["a" * 4097], "options.photos", "", "names of at most 4096 characters"),
             ]
         ),
         (

@@ -1,0 +1,128 @@
+"""Poses that exist already: poses files, results of a batch, kapture trajectories."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+from urllib.parse import unquote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clients.evaluation.results import read_results
+from visloc.errors import DatasetError, InvalidInput, refuse
+from visloc.geometry import Pose
+from visloc.kapture import read_dataset
+
+_T = TypeVar("_T")
+_RESULTS = "results.jsonl"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KnownPose:
+    """A pose of a file.
+
+    Attributes:
+        pose: ``cam_from_world``.
+        covariance: (6, 6) of rotation (rad) then translation; None where the file has none.
+    """
+
+    pose: Pose
+    covariance: NDArray[np.float64] | None = None
+
+
+def read_poses(path: Path) -> dict[str, KnownPose]:
+    """Read the poses of photos, by the photo's name.
+
+    Args:
+        path: a text file with lines ``name qw qx qy qz tx ty tz`` of ``cam_from_world``, as
+            ``localize batch``, hloc and kapture write them and visuallocalization.net takes them;
+            a kapture folder; ``results.jsonl``, or the folder that ``localize batch`` wrote.
+
+    Raises:
+        DatasetError: ``poses.missing``, ``poses.unreadable``, ``poses.line``, ``poses.duplicate``,
+            ``results.line``, ``kapture.*``.
+    """
+    if (path / _RESULTS).is_file():
+        path = path / _RESULTS
+    if path.is_dir():
+        dataset = read_dataset(path)
+        posed = ((record.path, dataset.pose(record)) for record in dataset.images)
+        return {name: KnownPose(pose) for name, pose in posed if pose is not None}
+    if not path.is_file():
+        raise refuse("poses.missing", field=str(path))
+    return dict(_of_results(path)) if path.suffix == ".jsonl" else _of_text(path)
+
+
+def of_photos(found: Mapping[str, _T], photos: Iterable[str]) -> tuple[dict[str, _T], int]:
+    """Find the photos that the names of a file stand for.
+
+    A name stands for the photo of that name. Otherwise it stands for the photo whose path ends
+    with it, as visuallocalization.net has base names for some data sets.
+
+    Returns:
+        The values by the photos' names, and the number of names that stand for no photo.
+
+    Raises:
+        DatasetError: ``poses.ambiguous`` when a name ends the paths of several photos;
+            ``poses.duplicate`` when two names stand for one photo.
+    """
+    photos = list(photos)
+    exact = set(photos)
+    ending: dict[str, list[str]] = defaultdict(list)
+    for photo in photos:
+        parts = photo.split("/")
+        for start in range(1, len(parts)):
+            ending["/".join(parts[start:])].append(photo)
+    values: dict[str, _T] = {}
+    unknown = 0
+    for name, value in found.items():
+        # Our own files write a blank as %20; other tools' files do not decode names.
+        spellings = (name, unquote(name))
+        known = [each for each in spellings if each in exact][:1]
+        fits = known or next((ending[each] for each in spellings if each in ending), [])
+        if len(fits) > 1:
+            raise refuse("poses.ambiguous", field=name, got=", ".join(fits[:3]))
+        if not fits:
+            unknown += 1
+        elif fits[0] in values:
+            raise refuse("poses.duplicate", field=name, got=fits[0])
+        else:
+            values[fits[0]] = value
+    return values, unknown
+
+
+def _of_results(path: Path) -> Iterator[tuple[str, KnownPose]]:
+    for result in read_results(path):
+        if result.pose is not None:
+            yield result.name, KnownPose(result.pose.cam_from_world, result.pose.covariance)
+        elif result.filled is not None:
+            yield result.name, KnownPose(result.filled.pose, result.filled.covariance)
+
+
+def _of_text(path: Path) -> dict[str, KnownPose]:
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise refuse("poses.unreadable", field=str(path), got=str(error)) from error
+    poses: dict[str, KnownPose] = {}
+    for number, line in enumerate(lines, start=1):
+        fields = line.split()
+        if not fields or fields[0].startswith("#"):
+            continue
+        where = f"{path}:{number}"
+        if len(fields) != 8:
+            raise refuse("poses.line", field=where, got=f"{len(fields)} fields: {line.strip()}")
+        if fields[0] in poses:
+            raise refuse("poses.duplicate", field=where, got=fields[0])
+        try:
+            numbers = [float(field) for field in fields[1:]]
+            poses[fields[0]] = KnownPose(Pose.from_quaternion(numbers[:4], numbers[4:]))
+        except InvalidInput as error:
+            raise error.about(where, DatasetError) from None
+        except ValueError:
+            raise refuse("poses.line", field=where, got=line.strip()) from None
+    return poses

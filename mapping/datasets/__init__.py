@@ -1,0 +1,52 @@
+"""Public data sets as their authors publish them, made into mapping and query datasets."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from mapping.datasets.cambridge import read_cambridge
+from mapping.datasets.seven_scenes import read_seven_scenes
+from mapping.stages.outputs import complete_output
+from visloc.errors import refuse
+from visloc.kapture import Dataset, write_dataset
+
+# The parts of a data set by name, such as mapping and query; root is the folder of the photos.
+Reader = Callable[[Path], Mapping[str, Dataset]]
+
+READERS: Mapping[str, Reader] = {
+    "7scenes": read_seven_scenes,
+    "cambridge": read_cambridge,
+}
+
+
+def write_parts(name: str, folder: Path, output: Path) -> Mapping[str, Dataset]:
+    """Write a folder for each part of a data set; photos are links to the archive.
+
+    Args:
+        name: a key of ``READERS``.
+        folder: the unpacked archive.
+        output: a folder to make.
+
+    Returns:
+        The parts; their notes tell what was left out.
+
+    Raises:
+        InvalidInput: ``archive.unknown``.
+        DatasetError: ``archive.missing``, ``archive.content``.
+        Conflict: ``import.exists``.
+    """
+    reader = READERS.get(name)
+    if reader is None:
+        raise refuse("archive.unknown", field="SET", expected=READERS, got=name)
+    if not folder.is_dir():
+        raise refuse("archive.missing", field=str(folder), expected="the unpacked archive")
+    parts = reader(folder)
+    with complete_output(output, "import.exists") as partial:
+        for part, dataset in parts.items():
+            sensors = partial / part / "sensors"
+            sensors.mkdir(parents=True)
+            (sensors / "records_data").symlink_to(folder.resolve())
+            write_dataset(replace(dataset, root=partial / part))
+    return parts

@@ -1,0 +1,81 @@
+"""Query photos matched with a map, for COLMAP's image_registrator."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapping.maps.colmap_database import DatabasePhoto
+from visloc.archive import Map
+from visloc.images import read_photo_file
+from visloc.kapture import Dataset
+from visloc.localization.localizer import Localizer
+from visloc.localization.solving import Look
+from visloc.options import LocalizeOptions
+
+# By pairs of rows, the lower one first.
+PairMatches = dict[tuple[int, int], NDArray[np.uint32]]
+
+
+def match_queries(
+    opened: Map, localizer: Localizer, queries: Dataset
+) -> tuple[list[DatabasePhoto], PairMatches, tuple[str, ...]]:
+    """Match the photos of a dataset with those that the map retrieves for them.
+
+    A query's keypoints are those that matched a landmark. A match with a landmark is one with each
+    retrieved photo that sees it.
+
+    Args:
+        opened: the map.
+        localizer: of the map.
+        queries: their poses are not used. A photo without a file, or of the name of a mapping
+            photo, is left out.
+
+    Returns:
+        The photos; their matches, where the rows of the map's photos come before those of the
+        queries; and notes.
+    """
+    photos: list[DatabasePhoto] = []
+    matches: PairMatches = {}
+    names = {image.name: row for row, image in enumerate(opened.images)}
+    left_out = []
+    for record in queries.images:
+        if record.path in names or not queries.has_file(record):
+            left_out.append(record.path)
+            continue
+        photo = read_photo_file(queries.path_of(record))
+        camera = queries.sensors[record.sensor_id].camera
+        look = localizer.look(photo, camera, LocalizeOptions())
+        row = len(names) + len(photos)
+        retrieved = [names[image.name] for image in look.evidence.retrieved]
+        matches |= {(image, row): rows for image, rows in _with_photos(opened, look, retrieved)}
+        keypoints = (look.matches.pixels * look.reduced).astype(np.float32)
+        # A name of its own: the camera of a query need not be the map's of that name.
+        sensor = f"query {record.sensor_id}"
+        photos.append(
+            DatabasePhoto(record.path, sensor, look.evidence.camera, keypoints, None, None)
+        )
+    if not left_out:
+        return photos, matches, ()
+    return photos, matches, (f"{len(left_out)} queries left out, such as {left_out[0]}",)
+
+
+def _with_photos(
+    opened: Map, look: Look, retrieved: Sequence[int]
+) -> list[tuple[int, NDArray[np.uint32]]]:
+    """Return, for each retrieved photo, rows of its keypoints and of the query's."""
+    found = []
+    for image in retrieved:
+        seen, _ = opened.observations(image)
+        order = np.argsort(seen, kind="stable")
+        place = np.minimum(np.searchsorted(seen[order], look.landmarks), max(len(seen) - 1, 0))
+        if len(seen) == 0 or len(look.landmarks) == 0:
+            continue
+        rows = order[place]
+        hit = seen[rows] == look.landmarks
+        if hit.any():
+            pairs = np.column_stack([rows[hit], np.flatnonzero(hit)])
+            found.append((image, pairs.astype(np.uint32)))
+    return found

@@ -1,0 +1,52 @@
+"""Pairs files: which photo goes with which, as kapture and hloc write them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from visloc.kapture.table import Table
+from visloc.kapture.writer import write_atomically
+
+_HEADER = "# query_image, map_image, score"
+
+
+class PairRow(NamedTuple):
+    """One line.
+
+    Attributes:
+        score: higher is better; None where the line has none.
+        table: where the line is, for errors.
+    """
+
+    first: str
+    second: str
+    score: float | None
+    table: Table
+
+
+def read_pair_rows(path: Path) -> Iterator[PairRow]:
+    """Read lines of two names, and a score or none.
+
+    kapture separates them by commas, hloc by blanks. A line with a comma is kapture's, so its names
+    may have blanks. Comments and blank lines are ignored.
+
+    Raises:
+        DatasetError: with file and line; ``kapture.unreadable``, ``kapture.encoding``,
+            ``pairs.column_count``, or ``kapture.number`` for a score that is not a finite number.
+    """
+    table = Table(Path(), str(path), None)  # so that errors name the whole path
+    for fields in table:
+        parts = fields if len(fields) > 1 else fields[0].split()
+        if len(parts) not in (2, 3):
+            raise table.error("pairs.column_count", got=len(parts))
+        score = table.numbers(parts[2:])[0] if len(parts) == 3 else None
+        yield PairRow(parts[0], parts[1], score, table)
+
+
+def write_pair_rows(path: Path, rows: Iterable[tuple[str, str, float]]) -> None:
+    """Write pairs as kapture has them, scores exactly; a file there is replaced."""
+    lines = [_HEADER, *(f"{first}, {second}, {score!r}" for first, second, score in rows)]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, ("\n".join(lines) + "\n").encode("utf-8"))

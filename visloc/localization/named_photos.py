@@ -1,0 +1,35 @@
+"""The mapping photos that a caller names instead of retrieving them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from visloc.archive import Map
+from visloc.errors import refuse
+
+
+class NamedPhotos:
+    """Finds the photos of a map by name; the table is made for the first caller who names one."""
+
+    def __init__(self, opened: Map) -> None:
+        self._map = opened
+
+    def rows(self, names: Sequence[str]) -> NDArray[np.int64]:
+        """Return the photos' rows (k,) in the map.
+
+        Raises:
+            InvalidInput: ``options.photos`` for a name that the map does not have.
+        """
+        for name in names:
+            if name not in self._row_of:
+                got = f"{name}, which map {self._map.ref} does not have"
+                raise refuse("options.photos", field="options.photos", got=got)
+        return np.array([self._row_of[name] for name in names], dtype=np.int64)
+
+    @cached_property
+    def _row_of(self) -> Mapping[str, int]:
+        return {image.name: row for row, image in enumerate(self._map.images)}
