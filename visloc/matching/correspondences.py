@@ -286,7 +286,7 @@ def _each_once(keypoints: NDArray[np.int64], landmarks: NDArray[np.int64]) -> ND
     """Tell which pairs (n,) to take, best first, so that no keypoint or landmark is taken twice."""
     of_keypoint, of_landmark = _first_rows(keypoints), _first_rows(landmarks)
     rows = np.arange(len(keypoints))
-    taken = (of_keypoint == rows) & (of_landmark == rows)
+    taken: NDArray[np.bool_] = (of_keypoint == rows) & (of_landmark == rows)
     # Most pairs are taken at once, or conflict with one that is. The others wait for each other.
     waiting = np.flatnonzero(~(taken[of_keypoint] | taken[of_landmark]))
     taken_keypoints: set[int] = set()
