@@ -44,6 +44,7 @@ from visloc.errors import InvalidInput, VislocError
 from visloc.images import ImageLimits, Photo
 from visloc.localization.constraints import MapGeometry
 from visloc.localization.localizer import Localizer
+from visloc.localization.places import solve_photo
 from visloc.localization.solving import Look, SeenImage, Solved
 from visloc.localization.turning import is_worth_turning
 from visloc.options import LocalizeOptions
@@ -122,24 +123,24 @@ class Vision:
             seen.append(target.look(image, decoded, job.options, job.priors, seconds))
             if seen[-1].error is not None:
                 raise seen[-1].error
-        row, best, solved = self._solve(job, targets, [(one,) for one in seen])
+        looked, best, target, solved = self._solve_photo(job, targets, seen)
         began = perf_counter()
         turned = self._turned(job, targets, decoded, seen, best.answer)
         if turned is not None:
-            again = self._solve(job, targets, [(one,) for one in turned]) if turned else None
+            again = self._solve_photo(job, targets, turned) if turned else None
             if again is not None and again[1].answer.pose is not None:
-                seen, (row, best, solved) = turned, again
+                looked, best, target, solved = again
             else:
                 best = _with_seconds(best, {"turns": perf_counter() - began})
                 if again is not None:  # its retrieved photos are still held as the photo is
                     coarse = again[1].answer.coarse
                     best = replace(best, answer=replace(best.answer, coarse=coarse))
-        look = seen[row].look
+        look = looked.look
         if not job.debug or look is None or not isinstance(decoded.query, Photo):
             return best
         self._step()
         told = gated(best, job.options)
-        return replace(best, debug=_picture(decoded.query, targets[row], look, told, solved))
+        return replace(best, debug=_picture(decoded.query, target, look, told, solved))
 
     def _turned(
         self,
@@ -232,12 +233,24 @@ class Vision:
         for target, images in zip(targets, seen, strict=True):
             self._step()
             solved.append(target.localizer.solve(images, options, job.priors, job.timestamp))
-        found = [
-            target.localization(one.answer, ypr=job.ypr)
-            for target, one in zip(targets, solved, strict=True)
-        ]
-        row, best = judged(found, job.priors)
-        return row, best, solved[row]
+        return _judged(job, targets, solved)
+
+    def _solve_photo(
+        self, job: RigJob, targets: Sequence[Target], seen: Sequence[SeenImage]
+    ) -> tuple[SeenImage, Localization, Target, Solved]:
+        """Solve for the pose of a photo on its own in every map, as ``_solve``.
+
+        Returns the photo as the chosen map saw it, the answer, and that map.
+        """
+        looked, solved, options = [], [], job.options.before_rivals()
+        for target, image in zip(targets, seen, strict=True):
+            self._step()
+            geometry = target.localizer.geometry
+            one = solve_photo(image, geometry, options, job.priors, job.timestamp)
+            looked.append(one[0])
+            solved.append(one[1])
+        row, best, chosen = _judged(job, targets, solved)
+        return looked[row], best, targets[row], chosen
 
     def rank_tiles(
         self,
@@ -378,3 +391,15 @@ def _picture(
         inliers,
         draw_overlay(photo, localizer.map, look, outcome, inliers),
     )
+
+
+def _judged(
+    job: RigJob, targets: Sequence[Target], solved: Sequence[Solved]
+) -> tuple[int, Localization, Solved]:
+    """Choose among the answers of several maps; return the row of the map too."""
+    found = [
+        target.localization(one.answer, ypr=job.ypr)
+        for target, one in zip(targets, solved, strict=True)
+    ]
+    row, best = judged(found, job.priors)
+    return row, best, solved[row]

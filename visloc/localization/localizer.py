@@ -19,7 +19,7 @@ from visloc.features import GlobalDescriptor, LocalFeatureExtractor, make_global
 from visloc.features.framing import Framing
 from visloc.features.local.readymade import is_ready_made
 from visloc.features.networks.lightglue.load import make_lightglue
-from visloc.geometry import Camera, Pose
+from visloc.geometry import Camera
 from visloc.images import Photo
 from visloc.localization.coarse import CoarsePoses
 from visloc.localization.constraints import Constraints, MapGeometry
@@ -27,6 +27,7 @@ from visloc.localization.evidence import Shown
 from visloc.localization.feature_cache import FeatureCache, find_features
 from visloc.localization.fingerprints import check_fingerprint
 from visloc.localization.named_photos import NamedPhotos
+from visloc.localization.places import solve_photo
 from visloc.localization.query_camera import query_resolution, resolve_camera
 from visloc.localization.query_features import (
     checked_global_descriptors,
@@ -206,7 +207,7 @@ class Localizer:
         """
         cache = {} if cache is None else cache
         look = self.look(photo, camera, options, priors, cache)
-        answer = self.solve_look(look, options, priors)[0]
+        answer = self._answer(look, options, priors)
         if isinstance(answer, Localized):
             return answer
         assert self.turns is not None  # the photo was looked at
@@ -214,7 +215,7 @@ class Localizer:
         if turned == 0:
             return answer
         look = self.look(photo, camera, options, priors, cache, turned)
-        again = self.solve_look(look, options, priors)[0]
+        again = self._answer(look, options, priors)
         # If this is refused too, its retrieved photos are still held as the photo is.
         return again if isinstance(again, Localized) else replace(answer, coarse=again.coarse)
 
@@ -241,7 +242,7 @@ class Localizer:
             TooLarge: ``features.too_many``.
         """
         look = self.look_at_features(features, camera, options, priors)
-        return self.solve_look(look, options, priors)[0]
+        return self._answer(look, options, priors)
 
     def look(
         self,
@@ -252,10 +253,7 @@ class Localizer:
         cache: FeatureCache | None = None,
         turned: int = 0,
     ) -> Look:
-        """Match one photo with the map; arguments and errors as for ``localize``.
-
-        ``turned`` is what ``turns`` found, or 0.
-        """
+        """Match a photo with the map, as ``localize``; ``turned`` is what ``turns`` found, or 0."""
         fusion = self._fusion(options)
         if self._extractor is None or not self._takes_photos(fusion):
             raise self._features_required(fusion)
@@ -326,7 +324,14 @@ class Localizer:
             The answer, and for each match (n,) whether the best pose explains it, even if that pose
             was refused.
         """
-        solved = self.solve([SeenImage("camera", Pose.identity(), look)], options, priors)
+        return self._told(look, self.solve([SeenImage.alone(look)], options, priors))
+
+    def _answer(self, look: Look, options: LocalizeOptions, priors: Priors) -> Answer:
+        """Find the pose of one photo."""
+        image, solved = solve_photo(SeenImage.alone(look), self.geometry, options, priors)
+        return self._told(image.look or look, solved)[0]
+
+    def _told(self, look: Look, solved: Solved) -> tuple[Answer, NDArray[np.bool_]]:
         answer, pose, refusal = solved.answer, solved.answer.pose, solved.answer.refusal
         none = np.zeros(len(look.matches.pixels), dtype=np.bool_)
         inliers = solved.inliers[0] if solved.inliers else none

@@ -112,6 +112,11 @@ class SeenImage:
     look: Look | None
     error: VislocError | None = None
 
+    @staticmethod
+    def alone(look: Look) -> SeenImage:
+        """Return a photo that is no part of a rig."""
+        return SeenImage("camera", Pose.identity(), look)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solved:

@@ -264,28 +264,45 @@ def settled(
     """Choose among proposed pairs (n,): the most votes first, then the most similar."""
     if len(keypoints) == 0:
         return Correspondences(keypoints, landmarks, votes, similarity)
-    # One row per distinct pair, with its support and its best similarity.
-    order = np.lexsort((landmarks, keypoints))
-    keypoints, landmarks = keypoints[order], landmarks[order]
-    starts = np.ones(len(keypoints), dtype=bool)
-    starts[1:] = (np.diff(keypoints) != 0) | (np.diff(landmarks) != 0)
-    first = np.flatnonzero(starts)
-    keypoints, landmarks = keypoints[first], landmarks[first]
+    # One row per distinct pair, with its support and its best similarity. One sort of one number
+    # takes half the time of a sort by two.
+    size = int(landmarks.max()) + 1
+    pairs = keypoints * size + landmarks
+    order = np.argsort(pairs, kind="stable")
+    pairs = pairs[order]
+    first = np.flatnonzero(np.diff(pairs, prepend=-1))
     support = np.add.reduceat(votes[order], first)
     similarity = np.maximum.reduceat(similarity[order], first)
 
-    order = np.lexsort((landmarks, keypoints, -similarity, -support))
+    best = np.lexsort((-similarity, -support))  # stable: of equal pairs, the first keypoint's
+    keypoints, landmarks = np.divmod(pairs[first][best], size)
+    chosen = _each_once(keypoints, landmarks)
+    return Correspondences(
+        keypoints[chosen], landmarks[chosen], support[best][chosen], similarity[best][chosen]
+    )
+
+
+def _each_once(keypoints: NDArray[np.int64], landmarks: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Tell which pairs (n,) to take, best first, so that no keypoint or landmark is taken twice."""
+    of_keypoint, of_landmark = _first_rows(keypoints), _first_rows(landmarks)
+    rows = np.arange(len(keypoints))
+    taken: NDArray[np.bool_] = (of_keypoint == rows) & (of_landmark == rows)
+    # Most pairs are taken at once, or conflict with one that is. The others wait for each other.
+    waiting = np.flatnonzero(~(taken[of_keypoint] | taken[of_landmark]))
     taken_keypoints: set[int] = set()
     taken_landmarks: set[int] = set()
-    kept = []
     for row, keypoint, landmark in zip(
-        order.tolist(), keypoints[order].tolist(), landmarks[order].tolist(), strict=True
+        waiting.tolist(), keypoints[waiting].tolist(), landmarks[waiting].tolist(), strict=True
     ):
         if keypoint not in taken_keypoints and landmark not in taken_landmarks:
             taken_keypoints.add(keypoint)
             taken_landmarks.add(landmark)
-            kept.append(row)
-    chosen = np.array(kept, dtype=np.int64)
-    return Correspondences(
-        keypoints[chosen], landmarks[chosen], support[chosen], similarity[chosen]
-    )
+            taken[row] = True
+    return taken
+
+
+def _first_rows(values: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return for each value (n,) the first row that has it."""
+    first = np.empty(int(values.max()) + 1, dtype=np.int64)
+    first[values[::-1]] = np.arange(len(values))[::-1]
+    return first[values]

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from collections import defaultdict
+
 import numpy as np
 import pytest
 import torch
@@ -10,6 +12,7 @@ from visloc.matching.correspondences import (
     Pairs,
     match_landmarks,
     mutual_nearest_neighbours,
+    settled,
 )
 from visloc.matching.products import EightBitRows, round_descriptors
 
@@ -166,6 +169,31 @@ def test_each_keypoint_and_each_landmark_is_used_once(
     assert len(set(pairs.keypoints.tolist())) == len(pairs)
     assert len(set(pairs.landmarks.tolist())) == len(pairs)
     assert (pairs.landmarks == pairs.keypoints // 2).mean() > 0.95
+
+
+@pytest.mark.parametrize("num", [0, 1, 40, 400])
+def test_pairs_are_taken_best_first_as_long_as_both_sides_are_free(num: int) -> None:
+    rng = np.random.default_rng(num)
+    keypoints, landmarks, ranks = (rng.integers(0, most, num) for most in (30, 25, 20))
+    votes, similarities = 1.0 / (ranks + 1), rng.choice([0.5, 0.6, 0.7], num).astype(np.float32)
+
+    support: dict[tuple[int, int], float] = defaultdict(float)
+    alike: dict[tuple[int, int], float] = defaultdict(float)
+    for keypoint, landmark, vote, similarity in zip(
+        keypoints.tolist(), landmarks.tolist(), votes.tolist(), similarities.tolist(), strict=True
+    ):
+        support[keypoint, landmark] += vote
+        alike[keypoint, landmark] = max(alike[keypoint, landmark], similarity)
+    expected: list[tuple[int, int]] = []
+    for pair in sorted(support, key=lambda each: (-support[each], -alike[each], each)):
+        if all(pair[0] != taken[0] and pair[1] != taken[1] for taken in expected):
+            expected.append(pair)
+
+    found = settled(keypoints, landmarks, votes, similarities)
+    pairs = list(zip(found.keypoints.tolist(), found.landmarks.tolist(), strict=True))
+    assert pairs == expected
+    assert found.support == pytest.approx([support[pair] for pair in expected])
+    assert found.similarities.tolist() == [alike[pair] for pair in expected]
 
 
 def test_the_number_of_threads_changes_nothing(
