@@ -26,7 +26,7 @@ _ABOVE_ALL = 2.0
 # Where proposals do not stand out among at most so many photos, the codes of all are compared; of
 # the best by these, so many rows and this share under the first descriptor, and of these the best
 # half under the next.
-_MAX_DOUBTFUL, _DOUBTFUL_ROWS, _DOUBTFUL_SHARE = 100_000, 1500, 0.09
+_MAX_DOUBTFUL, _DOUBTFUL_ROWS, _DOUBTFUL_SHARE = 50_000, 1500, 0.09
 _KEPT_BY_EACH = 0.5
 # Among more photos, so many times as many are proposed, from so many times as many lists. That is
 # done where less than half of what is wanted stands out: the query's place is not among them.
