@@ -1,7 +1,7 @@
 """The index of one map, from generated rows: time, memory and recall, with and without priors.
 
     OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 python -m benchmarks.index --work DIR
-        [--photos 100000] [--dim 1024] [--descriptors 2] [--queries 60] [--city]
+        [--photos 100000] [--dim 1024] [--descriptors 2] [--queries 60] [--city] [--no-priors]
 
 Rows are of one of two kinds. With ``--city`` they are those of ``benchmarks.generated_tiles``: as
 alike as the descriptors of real photos (docs/scale.md). Queries are photos taken beside them. Else
@@ -12,9 +12,10 @@ the place look in (40 %), and noise (25 %). A query is as far from a photo (cosi
 photo of its place and direction. So the best 20 of a query are photos of its place.
 
 Milliseconds are those of a core, since other programs may run; one thread computes. Rows and index
-are kept in DIR and found there again. Prints a table in Markdown; the truth is the
-comparison of all allowed photos. "near" allows a stretch of the map that holds the query's place,
-"random" any photos, "elsewhere" a stretch without the query's place.
+are kept in DIR and found there again: a run that was stopped goes on with what is missing. Prints a
+table in Markdown; the truth is the comparison of all allowed photos. "near" allows a stretch of the
+map that holds the query's place, "random" any photos, "elsewhere" a stretch without the query's
+place.
 """
 
 from __future__ import annotations
@@ -57,6 +58,7 @@ def main(
     descriptors: int = 2,
     queries: int = 60,
     city: Annotated[bool, typer.Option("--city", help="As alike as real ones, 242 wide.")] = False,
+    priors: Annotated[bool, typer.Option(help="Ask with priors too.")] = True,
 ) -> None:
     """Make, ask, print."""
     work.mkdir(parents=True, exist_ok=True)
@@ -65,13 +67,14 @@ def main(
     dim = len(cities[0].stds["within"]) if city else dim
     names = [f"{'city-' * city}{photos}-{dim}-{number}" for number in range(descriptors)]
     for number, name in enumerate(names):
-        if not (work / f"{name}.lists").exists():
+        if not (work / f"{name}.scales.npy").exists():
             made = (
                 (cities[number].tile(tile).rows for tile in range(photos // TILE))
                 if city
                 else rows_of_places(directions, dim, number + 1)
             )
             write_rows(work, name, made, (photos, dim))
+        if not (work / f"{name}.lists").exists():
             write_lists(work, name)
     # Loads faiss, which a process does once, whatever it opens.
     InvertedFile(np.eye(1, 64, dtype=np.float32), np.zeros(1, np.int64), work)
@@ -84,7 +87,7 @@ def main(
     named = dict(zip(names, cities, strict=False))
     asked = queries_in(named, queries) if city else queries_of(index, queries)
     typer.echo("| allowed | ms p50 / p95 | all compared, ms p50 | recall |\n|---|---|---|---|")
-    for kind, share in PRIORS:
+    for kind, share in PRIORS if priors else PRIORS[:1]:
         typer.echo(row_of(kind, share, index, asked))
     typer.echo(f"\n{anonymous_mb() - before:.1f} MB after all queries")
 

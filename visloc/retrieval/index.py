@@ -26,8 +26,11 @@ _ABOVE_ALL = 2.0
 # Where proposals do not stand out among at most so many photos, the codes of all are compared; of
 # the best by these, so many rows and this share under the first descriptor, and of these the best
 # half under the next.
-_MAX_DOUBTFUL, _DOUBTFUL_ROWS, _DOUBTFUL_SHARE = 100_000, 1500, 0.09
+_MAX_DOUBTFUL, _DOUBTFUL_ROWS, _DOUBTFUL_SHARE = 50_000, 1500, 0.09
 _KEPT_BY_EACH = 0.5
+# Among more photos, so many times as many are proposed, from so many times as many lists. That is
+# done where less than half of what is wanted stands out: the query's place is not among them.
+_WIDER_PROPOSED, _WIDER_LISTS = 20, 4
 
 
 class IndexKind(StrEnum):
@@ -75,10 +78,8 @@ def retrieve(
         fusion: fuses similarities into scores; it must use at least one of the descriptors.
     """
     index = {name: index[name] for name in fusion.counted(index)}
-    compared, limits = _proposed(query, index, top_k, photo_weights)
-    cosines = _cosines(query, index, compared)
-    if limits and not _stand_out(cosines, limits, top_k, fusion):
-        compared, cosines = _best_by_codes(query, index, top_k, photo_weights, fusion)
+    allowed = None if photo_weights is None else photo_weights > 0
+    compared, cosines = _compared(query, index, top_k, allowed, fusion)
     scores = fusion.scores(cosines)
     photos = np.arange(len(scores)) if compared is None else compared
     candidates = np.arange(len(scores))
@@ -119,70 +120,89 @@ def compare(
     return Retrieved(photos, fusion.scores(cosines), cosines)
 
 
-def _proposed(
+def _compared(
     query: Mapping[str, NDArray[np.float32]],
     index: Mapping[str, GlobalRows],
     top_k: int,
-    photo_weights: NDArray[np.float64] | None,
-) -> tuple[NDArray[np.int64] | None, Mapping[str, float]]:
-    """The photos to compare with the query, in the order of the map; None for all.
+    allowed: NDArray[np.bool_] | None,
+    fusion: LateFusion,
+) -> tuple[NDArray[np.int64] | None, dict[str, NDArray[np.float64]]]:
+    """The photos to rank, in the order of the map, and their cosines by descriptor.
+
+    The photos are None where all of them are compared.
+    """
+    files = {name: rows.inverted for name, rows in index.items() if rows.inverted is not None}
+    if len(files) < len(index):
+        return None, _cosines(query, index, None)
+    if allowed is None:
+        allowed = np.ones(len(next(iter(index.values()))), np.bool_)
+    left = int(np.count_nonzero(allowed))
+    if left <= _MAX_ALLOWED_EXACT:
+        photos = np.flatnonzero(allowed)
+        return photos, _cosines(query, index, photos)
+    count, lists = max(_MIN_PROPOSED, _PROPOSED_PER_RESULT * top_k), _LISTS
+    many = left > _MAX_DOUBTFUL
+    if many:
+        # Photos that priors leave may lie in lists further away; if few, doubts about the
+        # proposals cost less than more lists.
+        lists = math.ceil(lists * len(allowed) / left)
+    photos, limits = _proposed(query, files, allowed, min(left, count), lists)
+    cosines = _cosines(query, index, photos)
+    if _num_outstanding(cosines, limits, fusion) >= (top_k / 2 if many else top_k):
+        return photos, cosines
+    if many:
+        count, lists = min(left, _WIDER_PROPOSED * count), _WIDER_LISTS * lists
+        photos, limits = _proposed(query, files, allowed, count, lists)
+        if _ABOVE_ALL not in limits.values():
+            return photos, _cosines(query, index, photos)
+    return _best_by_codes(query, index, files, top_k, allowed, fusion)
+
+
+def _proposed(
+    query: Mapping[str, NDArray[np.float32]],
+    files: Mapping[str, InvertedFile],
+    allowed: NDArray[np.bool_],
+    count: int,
+    num_lists: int,
+) -> tuple[NDArray[np.int64], dict[str, float]]:
+    """The allowed photos that are most like the query by their codes, in the order of the map.
 
     Also returns, by descriptor, the cosine that photos which were not proposed have at most, as
-    far as codes can tell. Empty where no other photos shall be compared.
+    far as codes can tell: ``_ABOVE_ALL`` where there were fewer than ``count`` to propose.
     """
-    files = _inverted(index)
-    if len(files) < len(index):
-        return None, {}
-    num = left = len(next(iter(index.values())))
-    allowed = None if photo_weights is None else photo_weights > 0
-    if allowed is not None:
-        left = int(np.count_nonzero(allowed))
-        if left <= _MAX_ALLOWED_EXACT:
-            return np.flatnonzero(allowed), {}
-    count = min(left, max(_MIN_PROPOSED, _PROPOSED_PER_RESULT * top_k))
-    # Photos that priors leave may lie in lists further away; if few, doubts about the proposals
-    # cost less than more lists.
-    searched = math.ceil(_LISTS * num / left) if left > _MAX_DOUBTFUL else _LISTS
     photos, limits = [], {}
     for name, file in files.items():
-        found, rough = file.rough_cosines(
-            query[name], file.nearest_lists(query[name], searched), allowed
-        )
+        lists = file.nearest_lists(query[name], num_lists)
+        found, rough = file.rough_cosines(query[name], lists, allowed)
         best = largest(rough, count)
         photos.append(found[best])
         enough = len(best) == count
         limits[name] = float(rough[best].min()) + file.error if enough else _ABOVE_ALL
-    sure = left > _MAX_DOUBTFUL and _ABOVE_ALL not in limits.values()
-    return np.unique(np.concatenate(photos)), {} if sure else limits
+    return np.unique(np.concatenate(photos)), limits
 
 
-def _stand_out(
-    cosines: Mapping[str, NDArray[np.float64]],
-    limits: Mapping[str, float],
-    top_k: int,
-    fusion: LateFusion,
-) -> bool:
-    """Tell whether the best proposals are better than any other photo can be."""
+def _num_outstanding(
+    cosines: Mapping[str, NDArray[np.float64]], limits: Mapping[str, float], fusion: LateFusion
+) -> int:
+    """Count the proposals that are at least as good as any other photo can be."""
     scores = fusion.scores({name: np.append(row, limits[name]) for name, row in cosines.items()})
-    return int(np.count_nonzero(scores[:-1] >= scores[-1])) >= top_k
+    return int(np.count_nonzero(scores[:-1] >= scores[-1]))
 
 
 def _best_by_codes(
     query: Mapping[str, NDArray[np.float32]],
     index: Mapping[str, GlobalRows],
+    files: Mapping[str, InvertedFile],
     top_k: int,
-    photo_weights: NDArray[np.float64] | None,
+    allowed: NDArray[np.bool_],
     fusion: LateFusion,
 ) -> tuple[NDArray[np.int64], dict[str, NDArray[np.float64]]]:
     """The allowed photos with the best fused scores by their codes, in the order of the map.
 
     Also returns their cosines by descriptor.
     """
-    allowed = np.ones(len(next(iter(index.values()))), np.bool_)
-    if photo_weights is not None:
-        allowed = photo_weights > 0
     photos, cosines = np.flatnonzero(allowed), {}
-    for name, file in _inverted(index).items():
+    for name, file in files.items():
         found, rough = file.rough_cosines(query[name], np.arange(len(file.sizes)), allowed)
         every = np.full(len(allowed), -1.0)
         every[found] = rough
@@ -194,10 +214,6 @@ def _best_by_codes(
         cosines[name] = rows.cosines(query[name], photos)
         count = math.ceil(_KEPT_BY_EACH * count)
     return photos, cosines
-
-
-def _inverted(index: Mapping[str, GlobalRows]) -> dict[str, InvertedFile]:
-    return {name: rows.inverted for name, rows in index.items() if rows.inverted is not None}
 
 
 def _cosines(

@@ -63,9 +63,12 @@ class InvertedFile:
         centers: (C, D') float32, one row for each list; D' is ``width_of(D)``.
         sizes: (C,) int64, rows of each list.
         lists: the file: for each list its codes, then the numbers of its rows as int64.
+
+    Attributes:
+        error: two standard deviations of a rough cosine to a query that is like no centre.
     """
 
-    __slots__ = ("_index", "_lengths", "centers", "num_rows", "path", "sizes")
+    __slots__ = ("_index", "_lengths", "centers", "error", "num_rows", "path", "sizes")
 
     def __init__(self, centers: NDArray[np.float32], sizes: NDArray[np.int64], lists: Path) -> None:
         faiss = _faiss()
@@ -76,6 +79,7 @@ class InvertedFile:
         self.centers = np.require(centers, np.float32, ["C", "A"])
         self._index = _index(self.centers)
         self._lengths = _lengths(self.centers)
+        self.error = _error(self.centers, self._lengths, sizes)
         mapped = faiss.OnDiskInvertedLists()
         mapped.nlist, mapped.code_size = count, self._index.code_size
         mapped.totsize = self.num_rows * row_bytes(width)
@@ -89,15 +93,6 @@ class InvertedFile:
         self._index.replace_invlists(mapped, False)
         self._index.referenced_objects += (mapped,)
         self._index.ntotal = self.num_rows
-
-    @property
-    def error(self) -> float:
-        """Two standard deviations of a rough cosine; theorem 3.2 of Gao and Long 2024.
-
-        Codes describe what is left of unit rows without their centres.
-        """
-        left = 1 - np.average(self._lengths**2, weights=self.sizes) if self.num_rows else 1.0
-        return 2.0 * math.sqrt((math.pi / 2 - 1) / self.centers.shape[1] * max(float(left), 0.0))
 
     def nearest_lists(
         self, query: NDArray[np.float32], count: int, among: NDArray[np.int64] | None = None
@@ -267,6 +262,20 @@ def _lengths(centers: NDArray[np.float32]) -> NDArray[np.float32]:
     # Without squares of all in memory.
     squared = np.einsum("ij,ij->i", centers, centers)
     return np.asarray(np.maximum(np.sqrt(squared), _LEAST_ALIKE))
+
+
+def _error(
+    centers: NDArray[np.float32], lengths: NDArray[np.float32], sizes: NDArray[np.int64]
+) -> float:
+    """Two standard deviations of a rough cosine; theorem 3.2 of Gao and Long 2024.
+
+    The product that codes tell is that of what is left of a row and of a query without the centre.
+    Dimensions that were added for the width are zero in both, and do not count.
+    """
+    squared = float(np.clip(np.average(lengths**2, weights=sizes), 0, 1)) if sizes.any() else 0.0
+    row, query = 1 - squared, 1 + squared
+    dim = max(1, int(np.count_nonzero(centers.any(axis=0))))
+    return 2.0 * math.sqrt((math.pi / 2 - 1) / dim * row * query)
 
 
 def _coarse(centers: NDArray[np.float32]) -> Any:
