@@ -18,8 +18,9 @@ logger = logging.getLogger(__name__)
 # Errors of accept() when the system has no room for any connection. Its other errors concern only
 # the connection that was waiting.
 _SHORTAGES = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
-# Connections accepted in one turn of the event loop, so that a flood leaves time for requests.
-_BATCH = 16
+# Connections accepted in one turn of the event loop. All that are ready have their share of a turn,
+# and an answer takes a dozen turns: a flood must not make them long.
+_BATCH = 2
 # The time that a new connection has to send a request before it may be closed for the next. A flood
 # waits in the backlog, which is served in order.
 _LEAST_IDLE_S = 0.1
@@ -69,6 +70,11 @@ class OpenConnections:
 
     def __len__(self) -> int:
         return len(self._open)
+
+    @property
+    def is_crowded(self) -> bool:
+        """Whether requests that arrive hold most places."""
+        return 2 * len(self._arriving) > self.limit
 
     @property
     def is_busy(self) -> bool:
@@ -140,7 +146,7 @@ class OpenConnections:
     def _ranked(self) -> Iterator[tuple[Connection, float]]:
         """Give what may be closed, the best first, and since when it has waited."""
         idle, arriving = _longest(self._idle), _longest(self._arriving)
-        if arriving is not None and 2 * len(self._arriving) > self.limit:
+        if arriving is not None and self.is_crowded:
             yield arriving
         if idle is not None:
             yield idle
