@@ -20,6 +20,7 @@ from service.grpc.server import GrpcServer
 from service.http.acceptor import Acceptor, OpenConnections
 from service.http.app import create_app
 from service.http.backend import Backend
+from service.http.crowds import Patient
 from service.http.health import metrics_app
 from service.http.slow_clients import Arrivals, http_protocol
 from service.security.access import open_access
@@ -197,7 +198,7 @@ class _HttpServer(uvicorn.Server):
     ) -> None:
         super().__init__(
             uvicorn.Config(
-                app,
+                Patient(app, connections),
                 log_config=None,
                 log_level="error",  # its warnings are of callers' mistakes, one line for each
                 access_log=False,

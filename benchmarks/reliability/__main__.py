@@ -17,8 +17,9 @@ from typing import Annotated
 
 import typer
 
+from benchmarks.reliability.attackers import PAUSE_S
 from benchmarks.reliability.checks import print_checks
-from benchmarks.reliability.connections import connections
+from benchmarks.reliability.connections import Strength, behind_balancer, connections
 from benchmarks.reliability.heavy_requests import heavy_photos, many_values
 from benchmarks.reliability.kills import kill_service, kill_workers
 from benchmarks.reliability.maps import SampleMaps, make_maps
@@ -77,10 +78,19 @@ def s3_away_command(
 def connections_command(
     count: Annotated[int, typer.Option(help="Connections of each attack, at once.")] = 2500,
     seconds: Annotated[float, typer.Option(help="Of each attack.")] = 8.0,
+    pause: Annotated[
+        float, typer.Option(help="Seconds before a connection that was closed is opened again.")
+    ] = PAUSE_S,
+    kinds: Annotated[str, typer.Option(help="A word in the names of the attacks.")] = "",
+    balancer: Annotated[
+        bool, typer.Option(help="Attack one replica through HAProxy, from one address.")
+    ] = False,
 ) -> None:
     """Idle, slow and flooding connections, with 1024 and 65536 open files, without and with TLS."""
+    strength = Strength(count, seconds, pause, kinds)
+    withstood = behind_balancer if balancer else connections
     with _prepared() as (maps, work):
-        print_checks("connections", asyncio.run(connections(maps, work, count, seconds)))
+        print_checks("connections", asyncio.run(withstood(maps, work, strength)))
 
 
 @app.command("heavy-photos")

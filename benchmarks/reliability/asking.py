@@ -20,7 +20,7 @@ from google.rpc.error_details_pb2 import ErrorInfo
 from google.rpc.status_pb2 import Status
 
 from benchmarks.reliability.maps import Photo, SampleMaps
-from benchmarks.reliability.service_process import ServiceProcess
+from benchmarks.reliability.service_process import Addresses
 from visloc.geometry import Camera
 from visloc_api.v1.localization_pb2 import Camera as WireCamera
 from visloc_api.v1.localization_pb2 import LocalizeRequest
@@ -67,7 +67,7 @@ class Outcome:
 class Doors:
     """Connections to both doors of a service."""
 
-    def __init__(self, service: ServiceProcess) -> None:
+    def __init__(self, service: Addresses) -> None:
         # No limits: the requests that wait are the test.
         limits = httpx.Limits(max_connections=None, max_keepalive_connections=64)
         self.http = httpx.AsyncClient(
@@ -93,7 +93,7 @@ class Doors:
         await self._channel.close(None)
 
 
-def channel_to(service: ServiceProcess, *options: tuple[str, int]) -> grpc.aio.Channel:
+def channel_to(service: Addresses, *options: tuple[str, int]) -> grpc.aio.Channel:
     """Open a channel, with TLS where the service has it."""
     if service.trust is None:
         return grpc.aio.insecure_channel(service.grpc, options=options)

@@ -7,19 +7,20 @@ literals without an index, RFC 7541 section 6.2.2).
 from __future__ import annotations
 
 import asyncio
+import multiprocessing
 import socket
 import ssl
 import struct
 from collections import Counter
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
+from multiprocessing.connection import Connection
 
 Play = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 
-# Before a connection that was closed is opened again. Faster, it is a flood of requests, which the
-# balancer's limits per address are for.
-_PAUSE_S = 10.0
+# Before a connection that was closed is opened again.
+PAUSE_S = 10.0
 # A flood sends so many bytes, twenty times a second, on each of its connections.
 _FLOOD_BYTES, _FLOOD_PAUSE_S = 4096, 0.05
 _PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"
@@ -51,53 +52,109 @@ class Attack:
 
 
 @dataclass(frozen=True)
-class Target:
-    """What is attacked: a port of this machine, and TLS for it if any."""
+class Assault:
+    """An attack on a port of this machine.
 
+    Attributes:
+        name: of one of ``ATTACKS``.
+        port: that is attacked.
+        connections: at once.
+        tls: whether the port speaks it.
+        pause_s: before a connection that was closed is opened again.
+        source: the address from which the connections come.
+    """
+
+    name: str
     port: int
-    tls: ssl.SSLContext | None = None
-    host: str = "127.0.0.1"
+    connections: int
+    tls: bool = False
+    pause_s: float = PAUSE_S
+    source: str = "127.0.0.1"
+
+    @property
+    def attack(self) -> Attack:
+        """What its connections do."""
+        return next(each for each in ATTACKS if each.name == self.name)
 
 
 @asynccontextmanager
-async def attacked(target: Target, attack: Attack, connections: int) -> AsyncIterator[Counter[str]]:
-    """Attack while the block runs. Connections that end are opened again after a pause.
+async def attacked(assaults: Sequence[Assault]) -> AsyncIterator[Counter[str]]:
+    """Attack while the block runs, from a process of its own, which slows no honest client down.
 
     Yields:
-        How many were opened, refused and closed by the service.
+        How many connections were opened and ended; filled when the block has ended.
     """
     seen: Counter[str] = Counter()
-    running = [asyncio.create_task(_attacker(target, attack, seen)) for _ in range(connections)]
+    spawning = multiprocessing.get_context("spawn")
+    ours, theirs = spawning.Pipe()
+    process = spawning.Process(
+        target=_attack_until_told, args=(tuple(assaults), theirs), daemon=True
+    )
+    process.start()
+    theirs.close()
     try:
+        await asyncio.to_thread(ours.recv)  # it has begun
         yield seen
     finally:
-        for task in running:
-            task.cancel()
-        await asyncio.gather(*running, return_exceptions=True)
+        ours.send(None)
+        seen.update(await asyncio.to_thread(ours.recv))
+        await asyncio.to_thread(process.join)
 
 
-async def _attacker(target: Target, attack: Attack, seen: Counter[str]) -> None:
+def _attack_until_told(assaults: Sequence[Assault], pipe: Connection) -> None:
+    asyncio.run(_attack(assaults, pipe))
+
+
+async def _attack(assaults: Sequence[Assault], pipe: Connection) -> None:
+    seen: Counter[str] = Counter()
+    running = [
+        asyncio.create_task(_attacker(assault, context, seen))
+        for assault in assaults
+        for context in [_strangers_tls(assault)]
+        for _ in range(assault.connections)
+    ]
+    pipe.send(None)
+    await asyncio.to_thread(pipe.recv)
+    for task in running:
+        task.cancel()
+    await asyncio.gather(*running, return_exceptions=True)
+    pipe.send(seen)
+
+
+def _strangers_tls(assault: Assault) -> ssl.SSLContext | None:
+    """The TLS of an attack's connections; strangers do not look at certificates."""
+    if not assault.tls or assault.attack.hides_tls:
+        return None
+    context = ssl.create_default_context()
+    context.check_hostname = False
+    context.verify_mode = ssl.CERT_NONE
+    if assault.attack.api == "gRPC":
+        context.set_alpn_protocols(["h2"])
+    return context
+
+
+async def _attacker(assault: Assault, tls: ssl.SSLContext | None, seen: Counter[str]) -> None:
     while True:
         with suppress(OSError, asyncio.IncompleteReadError):
-            reader, writer = await _connected(target, attack)
+            reader, writer = await _connected(assault, tls)
             seen["opened"] += 1
             try:
-                await attack.play(reader, writer)
+                await assault.attack.play(reader, writer)
             finally:
                 seen["ended"] += 1
                 writer.transport.abort()
-        await asyncio.sleep(_PAUSE_S)
+        await asyncio.sleep(assault.pause_s)
 
 
 async def _connected(
-    target: Target, attack: Attack
+    assault: Assault, tls: ssl.SSLContext | None
 ) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
     connection = socket.socket()
     connection.setblocking(False)
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)  # for those that do not read
     try:
-        await asyncio.get_running_loop().sock_connect(connection, (target.host, target.port))
-        tls = None if attack.hides_tls else target.tls
+        connection.bind((assault.source, 0))
+        await asyncio.get_running_loop().sock_connect(connection, ("127.0.0.1", assault.port))
         name = None if tls is None else "localhost"
         return await asyncio.open_connection(
             sock=connection, ssl=tls, server_hostname=name, limit=1024

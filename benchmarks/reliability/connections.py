@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import re
 import resource
-import ssl
 import subprocess
 import time
 from collections import Counter
@@ -21,11 +20,12 @@ from grpc_health.v1 import health_pb2
 from grpc_health.v1.health_pb2_grpc import HealthStub
 
 from benchmarks.reliability.asking import Case, Doors, channel_to, good_cases
-from benchmarks.reliability.attackers import ATTACKS, Attack, Target, attacked
+from benchmarks.reliability.attackers import ATTACKS, PAUSE_S, Assault, Attack, attacked
 from benchmarks.reliability.checks import Check, counts_text
 from benchmarks.reliability.load import Asked, ask_in_turn, percentile
 from benchmarks.reliability.maps import SampleMaps
-from benchmarks.reliability.service_process import ServiceProcess, free_port
+from benchmarks.reliability.replicas import balanced
+from benchmarks.reliability.service_process import Addresses, ServiceProcess, free_port
 from benchmarks.reliability.soak import Expected, unloaded_answers
 
 FLOODING = 10  # connections of a flood
@@ -36,13 +36,43 @@ _PROBE_EVERY_S = 0.5
 # gRPC itself refuses what comes in the moment in which all its places are taken.
 _REFUSED_BY_GRPC = 1
 _WARM_S = 3.0
+OWN_ADDRESS, ANOTHER_ADDRESS = "127.0.0.1", "127.0.0.2"
+
+
+@dataclass(frozen=True)
+class Strength:
+    """How hard the attacks are.
+
+    Attributes:
+        count: connections of every attack that is no flood.
+        seconds: of each attack.
+        pause_s: before a connection that was closed is opened again.
+        kinds: a word that the names of the attacks have; empty for all.
+    """
+
+    count: int
+    seconds: float
+    pause_s: float = PAUSE_S
+    kinds: str = ""
 
 
 @dataclass(frozen=True)
 class Besieged:
-    """A service, and what is asked of it meanwhile."""
+    """A service, and what is asked of it meanwhile.
+
+    Attributes:
+        service: its process.
+        front: where callers find it: the service itself, or the balancer before it.
+        source: the address from which it is attacked.
+        doors: to the front.
+        cases: what honest clients ask.
+        expected: what they are answered.
+        metrics_port: of the service.
+    """
 
     service: ServiceProcess
+    front: Addresses
+    source: str
     doors: Doors
     cases: Sequence[Case]
     expected: Expected
@@ -52,8 +82,7 @@ class Besieged:
 async def connections(
     maps: SampleMaps,
     work: Path,
-    count: int,
-    seconds: float,
+    strength: Strength,
     limits: Sequence[int] = (1024, 65536),
     *,
     tls: Sequence[bool] = (False, True),
@@ -63,55 +92,81 @@ async def connections(
     Args:
         maps: to serve.
         work: folder for logs and a certificate.
-        count: connections of every attack that is no flood.
-        seconds: of each attack.
-        limits: of open files; what the hard limit of this process does not allow is left out.
+        strength: of the attacks.
+        limits: of open files; instead of more than this process may have, as many as it may.
         tls: whether the service speaks it.
     """
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
     checks = []
-    for limit in (limit for limit in limits if limit <= most):
+    for limit in limits:
         for with_tls in tls:
-            checks += await _withstood(maps, work, limit, with_tls, count, seconds)
+            checks += await _withstood(maps, work, min(limit, most), with_tls, strength)
     return checks
 
 
 async def _withstood(
-    maps: SampleMaps, work: Path, limit: int, with_tls: bool, count: int, seconds: float
+    maps: SampleMaps, work: Path, limit: int, with_tls: bool, strength: Strength
 ) -> list[Check]:
     where = f"{limit} files, {'TLS' if with_tls else 'no TLS'}"
     log = work / f"service-{limit}-{with_tls}.log"
     metrics_port = free_port()
     own = certificate(work) if with_tls else None
     before = ["bash", "-c", f'ulimit -n {limit}\nexec "$@"', "-"]
-    cases = [case for case in good_cases(maps) if " photo " in case.name and "two" not in case.name]
-    checks = []
     with ServiceProcess(
         maps.folder, log, before=before, certificate=own, metrics_port=metrics_port
     ) as service:
-        async with Doors(service) as doors:
-            expected = await unloaded_answers(doors, maps, cases)
-            besieged = Besieged(service, doors, cases, expected, metrics_port)
-            await ask_in_turn(doors, cases, 1, _WARM_S)
-            for attack in ATTACKS:
-                if with_tls or not attack.hides_tls:
-                    check = await _attack(besieged, attack, count, seconds)
-                    checks.append(Check(f"{where}: {check[0]}", *check[1:]))
+        return await _attacked_in_turn(
+            where, maps, service, service.addresses, OWN_ADDRESS, metrics_port, strength
+        )
+
+
+async def behind_balancer(maps: SampleMaps, work: Path, strength: Strength) -> list[Check]:
+    """Attack a service through the balancer that comes with it, all from one address."""
+    metrics_port = free_port()
+    with balanced([maps.folder], work, metrics_port=metrics_port) as found:
+        [service], http_port = found.replicas, int(found.http.rpartition(":")[2])
+        front = Addresses(found.http, http_port, found.grpc.removeprefix("grpc://"))
+        return await _attacked_in_turn(
+            "balancer", maps, service, front, ANOTHER_ADDRESS, metrics_port, strength
+        )
+
+
+async def _attacked_in_turn(
+    where: str,
+    maps: SampleMaps,
+    service: ServiceProcess,
+    front: Addresses,
+    source: str,
+    metrics_port: int,
+    strength: Strength,
+) -> list[Check]:
+    cases = [case for case in good_cases(maps) if " photo " in case.name and "two" not in case.name]
+    checks = []
+    async with Doors(front) as doors:
+        expected = await unloaded_answers(doors, maps, cases)
+        besieged = Besieged(service, front, source, doors, cases, expected, metrics_port)
+        await ask_in_turn(doors, cases, 1, _WARM_S)
+        for attack in (each for each in ATTACKS if strength.kinds in each.name):
+            if front.trust is not None or not attack.hides_tls:
+                check = await _attack(besieged, attack, strength)
+                checks.append(Check(f"{where}: {check[0]}", *check[1:]))
     return checks
 
 
-async def _attack(
-    besieged: Besieged, attack: Attack, count: int, seconds: float
-) -> tuple[str, str, bool]:
+async def _attack(besieged: Besieged, attack: Attack, strength: Strength) -> tuple[str, str, bool]:
     """Ask alone, and then beside an attack."""
     service, doors, cases = besieged.service, besieged.doors, besieged.cases
+    seconds = strength.seconds
     seed = hash(attack.name) % 1000
     alone = await ask_in_turn(doors, cases, 1, seconds, seed)
     lines = _lines(service.log)
-    port = service.http_port if attack.api == "HTTP" else service.grpc_port
-    number = FLOODING if attack.is_flood else count // attack.one_in
-    async with attacked(Target(port, attacking_tls(service, attack)), attack, number) as seen:
+    front = besieged.front
+    port = front.http_port if attack.api == "HTTP" else int(front.grpc.rpartition(":")[2])
+    number = FLOODING if attack.is_flood else strength.count // attack.one_in
+    has_tls = front.trust is not None
+    assault = Assault(attack.name, port, number, has_tls, strength.pause_s, besieged.source)
+    async with attacked([assault]) as seen:
         await asyncio.sleep(1)
         probes = asyncio.create_task(probed(besieged, seconds))
         beside = await ask_in_turn(doors, cases, 1, seconds, seed)
@@ -137,18 +192,6 @@ async def _attack(
     )
 
 
-def attacking_tls(service: ServiceProcess, attack: Attack) -> ssl.SSLContext | None:
-    """The TLS of an attack's connections; strangers do not look at certificates."""
-    if service.trust is None:
-        return None
-    context = ssl.create_default_context()
-    context.check_hostname = False
-    context.verify_mode = ssl.CERT_NONE
-    if attack.api == "gRPC":
-        context.set_alpn_protocols(["h2"])
-    return context
-
-
 def certificate(work: Path) -> tuple[Path, Path]:
     """Make a certificate for this machine; the files of it and of its key."""
     cert, key = work / "cert.pem", work / "key.pem"
@@ -166,12 +209,12 @@ def certificate(work: Path) -> tuple[Path, Path]:
 
 async def probed(besieged: Besieged, seconds: float) -> Mapping[str, list[float]]:
     """Ask for health and metrics over new connections; the seconds of each, infinity for failed."""
-    service = besieged.service
+    front, metrics = besieged.front, f"http://127.0.0.1:{besieged.metrics_port}/metrics"
     asked: dict[str, Callable[[], Awaitable[None]]] = {
-        "/healthz": lambda: _get(f"{service.url}/healthz", service),
-        "/readyz": lambda: _get(f"{service.url}/readyz", service),
-        "metrics": lambda: _get(f"http://127.0.0.1:{besieged.metrics_port}/metrics", service),
-        "gRPC health": lambda: _check(service),
+        "/healthz": lambda: _get(f"{front.url}/healthz", front),
+        "/readyz": lambda: _get(f"{front.url}/readyz", front),
+        "metrics": lambda: _get(metrics, front),
+        "gRPC health": lambda: _check(front),
     }
     found = await asyncio.gather(*(_probed(probe, seconds) for probe in asked.values()))
     return dict(zip(asked, found, strict=True))
@@ -189,14 +232,14 @@ async def _probed(probe: Callable[[], Awaitable[None]], seconds: float) -> list[
     return found
 
 
-async def _get(url: str, service: ServiceProcess) -> None:
-    async with httpx.AsyncClient(timeout=5, verify=service.tls()) as http:
+async def _get(url: str, front: Addresses) -> None:
+    async with httpx.AsyncClient(timeout=5, verify=front.tls()) as http:
         (await http.get(url)).raise_for_status()
 
 
-async def _check(service: ServiceProcess) -> None:
+async def _check(front: Addresses) -> None:
     # A channel of its own, which would otherwise share the connection of the last one.
-    async with channel_to(service, ("grpc.use_local_subchannel_pool", 1)) as channel:
+    async with channel_to(front, ("grpc.use_local_subchannel_pool", 1)) as channel:
         await HealthStub(channel).Check(health_pb2.HealthCheckRequest(), timeout=5)
 
 

@@ -57,7 +57,7 @@ async def kill_workers(maps: SampleMaps, work: Path, kills: int) -> list[Check]:
     """Kill workers one after another while clients ask."""
     cases = good_cases(maps)
     with ServiceProcess(maps.folder, work / "service.log", workers=2) as service:
-        async with Doors(service) as doors:
+        async with Doors(service.addresses) as doors:
             expected = await unloaded_answers(doors, maps, cases)
             stop = asyncio.Event()
             asking = asyncio.create_task(persist(doors, cases, CLIENTS, stop, WORKER_DIED))
@@ -85,7 +85,7 @@ async def kill_service(maps: SampleMaps, work: Path, kills: int) -> list[Check]:
     cases = good_cases(maps)
     service = ServiceProcess(maps.folder, work / "service.log", workers=1)
     with service:
-        async with Doors(service) as doors:
+        async with Doors(service.addresses) as doors:
             expected = await unloaded_answers(doors, maps, cases)
             # The version that comes and goes; the others must survive.
             coming = maps.folder / "room" / maps.versions["room"][-1]

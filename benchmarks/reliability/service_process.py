@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -18,6 +19,29 @@ from typing import Self
 import httpx
 
 READY_WITHIN_S = 90.0
+
+
+@dataclass(frozen=True)
+class Addresses:
+    """Where a service is, or a balancer before services.
+
+    Attributes:
+        url: of its HTTP API.
+        http_port: the port in it.
+        grpc: host and port.
+        trust: its certificate, where it speaks TLS.
+    """
+
+    url: str
+    http_port: int
+    grpc: str
+    trust: bytes | None = None
+
+    def tls(self) -> ssl.SSLContext | bool:
+        """What a client needs to trust it: its certificate, if it has one."""
+        if self.trust is None:
+            return False
+        return ssl.create_default_context(cadata=self.trust.decode())
 
 
 class ServiceProcess:
@@ -85,6 +109,11 @@ class ServiceProcess:
         """Of the processes that do the vision: the fork server's children."""
         return [pid for child in children_of(self.pid) for pid in children_of(child)]
 
+    @property
+    def addresses(self) -> Addresses:
+        """Where it is."""
+        return Addresses(self.url, self.http_port, self.grpc, self.trust)
+
     def start(self) -> None:
         """Begin; the doors may be closed yet."""
         with self.log.open("ab") as log:
@@ -107,15 +136,11 @@ class ServiceProcess:
     def is_ready(self) -> bool:
         """Whether /readyz says so."""
         try:
-            return httpx.get(f"{self.url}/readyz", timeout=5, verify=self.tls()).is_success
+            return httpx.get(
+                f"{self.url}/readyz", timeout=5, verify=self.addresses.tls()
+            ).is_success
         except httpx.TransportError:
             return False
-
-    def tls(self) -> ssl.SSLContext | bool:
-        """What a client needs to trust the service: its certificate, if it has one."""
-        if self.trust is None:
-            return False
-        return ssl.create_default_context(cadata=self.trust.decode())
 
     def kill(self) -> None:
         """Kill the main process, as the kernel does when memory is short."""

@@ -18,7 +18,7 @@ from typing import Any
 import httpx
 
 from benchmarks.reliability.asking import Case, Doors, Outcome, good_cases
-from benchmarks.reliability.attackers import ATTACKS, Attack, Target, attacked
+from benchmarks.reliability.attackers import ATTACKS, Assault, Attack, attacked
 from benchmarks.reliability.checks import Check, counts_text
 from benchmarks.reliability.heavy_requests import heavy_photo_requests, many_value_messages
 from benchmarks.reliability.load import RETRY_PAUSE_S, ask_in_turn, percentile
@@ -77,7 +77,7 @@ async def siege(maps: SampleMaps, work: Path, seconds: float) -> list[Check]:
             for n in range(2)
         ]
         async with AsyncExitStack() as opened:
-            doors = [await opened.enter_async_context(Doors(each)) for each in replicas]
+            doors = [await opened.enter_async_context(Doors(each.addresses)) for each in replicas]
             expected = await unloaded_answers(doors[0], maps, cases)
             alone = await asyncio.gather(
                 *(ask_in_turn(each, cases, 1, _CAPACITY_S) for each in doors)
@@ -134,11 +134,20 @@ async def _harm(
         for number, each in enumerate(replicas)
     ]
     async with AsyncExitStack() as attacks:
-        for replica in replicas:
-            for attack in (each for each in ATTACKS if not each.hides_tls):
-                number = _FLOODING if attack.is_flood else _HOLDING
-                target = Target(_port(replica, attack))
-                await attacks.enter_async_context(attacked(target, attack, number))
+        await attacks.enter_async_context(
+            attacked(
+                [
+                    Assault(
+                        attack.name,
+                        _port(replica, attack),
+                        _FLOODING if attack.is_flood else _HOLDING,
+                    )
+                    for replica in replicas
+                    for attack in ATTACKS
+                    if not attack.hides_tls
+                ]
+            )
+        )
         await asyncio.gather(
             _change(maps, doors, happened, stop),
             _kill_workers(replicas, happened, stop),
@@ -164,7 +173,7 @@ def _send_heavy(
     messages = [*heavy_photo_requests(maps), *many_value_messages().values()]
     while not stop.wait(_HEAVY_PAUSE_S):
         with suppress(OSError, httpx.HTTPError):
-            happened.attacks[messages[number % len(messages)](replica)] += 1
+            happened.attacks[messages[number % len(messages)](replica.addresses)] += 1
         number += 1
 
 

@@ -36,7 +36,7 @@ async def soak(maps: SampleMaps, work: Path, seconds: float) -> list[Check]:
     with ServiceProcess(
         maps.folder, work / "service.log", workers=1, max_queue=MAX_QUEUE, max_batches=2
     ) as service:
-        async with Doors(service) as doors:
+        async with Doors(service.addresses) as doors:
             expected = await unloaded_answers(doors, maps, [*good, *bad])
             mix = [*good, *good, *bad]
             capacity = await _capacity(doors, mix)

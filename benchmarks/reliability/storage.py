@@ -129,7 +129,7 @@ async def s3_away(every: SampleMaps, work: Path, seconds: float) -> list[Check]:
     cases = good_cases(maps)
     try:
         with service:
-            async with Doors(service) as doors:
+            async with Doors(service.addresses) as doors:
                 expected = await unloaded_answers(doors, maps, cases)
                 quiet = await ask_in_turn(doors, cases, 2, QUIET_S)
                 world = _World(maps, coming, cases, expected, quiet)

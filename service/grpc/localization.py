@@ -19,6 +19,7 @@ from service.grpc.messages import (
     rig_job_of,
     sequence_start_of,
 )
+from service.grpc.reading import converted
 from service.settings import ServiceSettings
 from service.telemetry.observer import Observer
 from service.values import InstantJob, SequenceJob
@@ -49,7 +50,7 @@ class LocalizationServicer(pb2_grpc.LocalizationServicer):
         async with self._envelope("Localize", id_, context):
             # Features take a moment to check: not on the event loop.
             async with within(self._limit):
-                job = await asyncio.to_thread(localize_job_of, request, self._max_request_bytes)
+                job = await converted(localize_job_of, request, self._max_request_bytes)
                 found = await self._engine.localize(job)
             self._observer.localization(found)
             answer = localize_response(found, id_)
@@ -63,7 +64,7 @@ class LocalizationServicer(pb2_grpc.LocalizationServicer):
         async with self._envelope("LocalizeRig", id_, context):
             with self._engine.admit_batch():
                 async with within(self._limit):
-                    job = await asyncio.to_thread(rig_job_of, request, self._limits)
+                    job = await converted(rig_job_of, request, self._limits)
                     found = await self._engine.localize_rig(job)
             self._observer.instant(found)
             return message_of(instant_answer(found, id_), pb2.InstantAnswer())
@@ -80,7 +81,7 @@ class LocalizationServicer(pb2_grpc.LocalizationServicer):
         first = await anext(request_iterator, None)
         id_ = request_id(first.start.request_id if first is not None else None)
         async with self._envelope("LocalizeSequence", id_, context, streams=True):
-            start = await asyncio.to_thread(sequence_start_of, first)
+            start = await converted(sequence_start_of, first)
             with self._engine.admit_batch():
                 async with (
                     aclosing(self._instants(request_iterator, start)) as instants,
@@ -97,9 +98,7 @@ class LocalizationServicer(pb2_grpc.LocalizationServicer):
     ) -> AsyncGenerator[InstantJob]:
         number, has_rig = 0, start.rig is not None
         async for message in messages:
-            yield await asyncio.to_thread(
-                instant_of, message, self._limits, number, has_rig=has_rig
-            )
+            yield await converted(instant_of, message, self._limits, number, has_rig=has_rig)
             number += 1
 
     async def ListMaps(  # noqa: N802

@@ -6,20 +6,17 @@ import asyncio
 from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import grpc
-from google.protobuf.message import DecodeError
 
 from service.errors import too_slow
 from service.grpc.calls import Handler, behaviour_of, handler_like
 from service.grpc.connections import GrpcConnections
 from service.grpc.envelope import Context, Envelope
-from service.grpc.wire_format import num_values
+from service.grpc.reading import Unread, reader_of
 from service.settings import SLOWEST_BYTES_PER_S
-from visloc.errors import InvalidInput, TimedOut, TooLarge, VislocError, refuse
-from visloc_api.words.json_text import check_num_values
-from visloc_api.words.message import MAX_INSTANT_VALUES
+from visloc.errors import InvalidInput, Overloaded, TimedOut
 
 # Calls whose only message may be large.
 _LARGE_MESSAGES = ("Localize", "LocalizeRig")
@@ -78,10 +75,14 @@ class TimelyCalls(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
             with self._connections.in_use(context.peer()):
                 try:
                     return await behaviour(_timely(messages, patience_s, place), context)
-                except (TimedOut, InvalidInput) as error:  # before the method's own envelope
+                except (
+                    InvalidInput,
+                    Overloaded,
+                    TimedOut,
+                ) as error:  # before the method's own envelope
                     await self._envelope.refuse(name, error, context)
 
-        return handler_like(handler, serve, readable_or_not(handler.request_deserializer))
+        return handler_like(handler, serve, reader_of(handler.request_deserializer))
 
 
 class Waiting:
@@ -115,42 +116,6 @@ class Waiting:
                 self._calls.pop(call, None)
 
 
-class _Unreadable(NamedTuple):
-    """Stands for a message that is not parsed; gRPC would end the call with its own error."""
-
-    error: VislocError
-
-
-def readable_or_not(parse: Callable[[bytes], Any] | None) -> Callable[[bytes], Any]:
-    """Return a parser that gives a stand-in for what ``parse`` refuses or should not see."""
-    # Generated code gives the parser of a message's class.
-    kind = getattr(parse, "__self__", None)
-
-    def parsed(message: bytes) -> Any:
-        if parse is None:
-            return message
-        try:
-            if kind is not None:
-                values = num_values(message, kind.DESCRIPTOR, MAX_INSTANT_VALUES + 1)
-                check_num_values(values, MAX_INSTANT_VALUES)
-            return parse(message)
-        except DecodeError as error:
-            return _Unreadable(_malformed(str(error)))
-        except TooLarge as error:
-            return _Unreadable(error)
-
-    return parsed
-
-
-def _malformed(got: str) -> VislocError:
-    return refuse(
-        "request.malformed",
-        "the message does not fit the method",
-        expected="a protobuf message as in localization.proto",
-        got=got,
-    )
-
-
 async def _timely(
     messages: AsyncIterator[Any], patience_s: float, place: Place
 ) -> AsyncGenerator[Any]:
@@ -162,6 +127,6 @@ async def _timely(
             raise too_slow(patience_s, "no message in that time") from None
         if message is None:
             return
-        if isinstance(message, _Unreadable):
-            raise message.error
+        if isinstance(message, Unread):
+            message = await message.read()
         yield message

@@ -18,8 +18,9 @@ logger = logging.getLogger(__name__)
 # Errors of accept() when the system has no room for any connection. Its other errors concern only
 # the connection that was waiting.
 _SHORTAGES = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
-# Connections accepted in one turn of the event loop, so that a flood leaves time for requests.
-_BATCH = 16
+# Connections accepted in one turn of the event loop. All that are ready have their share of a turn,
+# and an answer takes a dozen turns: a flood must not make them long.
+_BATCH = 2
 # The time that a new connection has to send a request before it may be closed for the next. A flood
 # waits in the backlog, which is served in order.
 _LEAST_IDLE_S = 0.1
@@ -52,11 +53,13 @@ class OpenConnections:
     """The open connections of a port, at most ``limit``.
 
     A connection is in use from the end of a request's arrival to the end of its answer. Before, its
-    request arrives, from the end of the head on; else it is idle. At the limit, one is closed for a
-    new one: the longest idle, and where none is, the one whose request has come no further for the
-    longest time, because a body may come very slowly. Where requests that arrive hold most places,
-    they come first: there is always an idle one, the newest, whose head has not been read yet, and
-    the others belong to clients that had their answers.
+    request arrives, from the end of the head on; else it is idle: new, with or without a TLS
+    handshake behind it, or between two requests. At the limit, one is closed for a new one: the
+    longest idle of the kind that has more, and where none is idle, the one whose request has come
+    no further for the longest time, because a body may come very slowly. Where requests that
+    arrive hold most places, they come first. So a flood closes its own connections: one that opens
+    many does not close those of clients that had their answers, nor do many that had answers and
+    ask no more close those that are about to ask.
     """
 
     def __init__(self, limit: int) -> None:
@@ -64,6 +67,7 @@ class OpenConnections:
         self._reserve = min(max(1, limit // 10), limit - 1)
         self._open: set[Connection] = set()
         # Since when; the longest first.
+        self._new: dict[Connection, float] = {}
         self._idle: dict[Connection, float] = {}
         self._arriving: dict[Connection, float] = {}
 
@@ -71,18 +75,24 @@ class OpenConnections:
         return len(self._open)
 
     @property
+    def is_crowded(self) -> bool:
+        """Whether requests that arrive hold most places."""
+        return 2 * len(self._arriving) > self.limit
+
+    @property
     def is_busy(self) -> bool:
         """Whether all connections are in use except the tenth reserved for health and metrics."""
-        in_use = len(self._open) - len(self._idle) - len(self._arriving)
+        in_use = len(self._open) - len(self._new) - len(self._idle) - len(self._arriving)
         return in_use > self.limit - self._reserve
 
     def add(self, connection: Connection) -> None:
         """Count a new connection, idle at first."""
         self._open.add(connection)
-        self._idle[connection] = monotonic()
+        self._new[connection] = monotonic()
 
     def remove(self, connection: Connection) -> None:
         self._open.discard(connection)
+        self._new.pop(connection, None)
         self._idle.pop(connection, None)
         self._arriving.pop(connection, None)
 
@@ -95,10 +105,11 @@ class OpenConnections:
             arriving: whether the body of one that is not answered has not arrived.
         """
         if in_use or arriving:
+            self._new.pop(connection, None)
             self._idle.pop(connection, None)
         if in_use or not arriving:
             self._arriving.pop(connection, None)
-        if connection in self._open and not in_use:
+        if connection in self._open and connection not in self._new and not in_use:
             (self._arriving if arriving else self._idle).setdefault(connection, monotonic())
 
     def renew(self, connection: Connection) -> None:
@@ -139,12 +150,13 @@ class OpenConnections:
 
     def _ranked(self) -> Iterator[tuple[Connection, float]]:
         """Give what may be closed, the best first, and since when it has waited."""
-        idle, arriving = _longest(self._idle), _longest(self._arriving)
-        if arriving is not None and 2 * len(self._arriving) > self.limit:
+        arriving = _longest(self._arriving)
+        if arriving is not None and self.is_crowded:
             yield arriving
-        if idle is not None:
-            yield idle
-        elif arriving is not None:
+        kinds = sorted((self._new, self._idle), key=len, reverse=True)
+        longest = [found for each in kinds if (found := _longest(each)) is not None]
+        yield from longest
+        if arriving is not None and not longest:
             yield arriving
 
     def _close(self, connection: Connection) -> None:

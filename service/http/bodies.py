@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Collection, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from time import monotonic, sleep
 from typing import TypeVar
 
 from starlette.requests import Request
 
 from service.api import jobs
+from service.api.parsing import ONE_BY_ONE
 from service.http.backend import backend_of
 from service.http.forms import Form, FormLimits, parse_form
 from service.settings import REQUEST_OVERHEAD_BYTES, ServiceSettings
 from service.values import InstantJob, RigJob, SequenceJob
 from visloc.errors import VislocError, refuse
+from visloc_api.words.json_text import num_json_values
 from visloc_api.words.maps import UseVersionRequest
-from visloc_api.words.message import MAX_INSTANT_VALUES
+from visloc_api.words.message import MAX_INSTANT_VALUES, MAX_JSON_VALUES
 from visloc_api.words.photo import LocalizeRequest
 from visloc_api.words.rigs import BatchLimits, LocalizeRigRequest
 from visloc_api.words.sequences import LocalizeSequenceRequest
@@ -26,7 +26,7 @@ from visloc_api.words.sequences import LocalizeSequenceRequest
 # The parts of the form of one photo that are files, and the file names in curl's examples.
 _FILES_PER_IMAGE = 2  # a photo and its mask
 _FILES = {"image": "photo.jpg", "features": "photo.json", "mask": "mask.png"}
-# JSON of one photo from which on it is parsed on its own.
+# JSON from which on it is parsed on its own, if it has not too many values before.
 _LARGE_BYTES = 2**20
 _FORM, _JSON = "multipart/form-data", "application/json"
 # Values in a sequence: each takes about a microsecond and 100 bytes to parse. A photo needs 16 for
@@ -38,42 +38,11 @@ JobT = TypeVar("JobT")
 ToJob = Callable[[str | bytes, Mapping[str, bytes]], JobT]
 
 
-class _OneByOne:
-    """Parses JSON that takes long in one thread, one text after the other.
-
-    Parsing holds Python's lock for some hundredths of a second at a time. Answering any other
-    request takes several turns of the event loop, and each turn would wait for every thread that
-    parses. So there is one, and it rests after each text for as long as it took.
-    """
-
-    def __init__(self) -> None:
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="json")
-        self._rests_until = 0.0
-
-    async def run(self, parse: Callable[[], JobT]) -> JobT:
-        """Return what ``parse`` returns; raises what it raises."""
-        return await asyncio.get_running_loop().run_in_executor(self._thread, self._parsed, parse)
-
-    def _parsed(self, parse: Callable[[], JobT]) -> JobT:
-        started = monotonic()
-        if started < self._rests_until:
-            sleep(self._rests_until - started)
-            started = monotonic()
-        try:
-            return parse()
-        finally:
-            ended = monotonic()
-            self._rests_until = ended + (ended - started)
-
-
-_ONE_BY_ONE = _OneByOne()
-
-
-async def parsed(body: bytes, parse: Callable[[bytes], JobT]) -> JobT:
-    """Parse the JSON of one photo, not on the event loop; raises what ``parse`` raises."""
-    if len(body) > _LARGE_BYTES:
-        return await _ONE_BY_ONE.run(partial(parse, body))
-    return await asyncio.to_thread(parse, body)
+async def parsed(text: str | bytes, parse: Callable[[], JobT]) -> JobT:
+    """Parse JSON, not on the event loop; raises what ``parse`` raises."""
+    if len(text) > _LARGE_BYTES or num_json_values(text) > MAX_JSON_VALUES:
+        return await ONE_BY_ONE.run(parse, len(text))
+    return await asyncio.to_thread(parse)
 
 
 async def read_localize_job(request: Request) -> RigJob:
@@ -104,7 +73,7 @@ async def read_localize_job(request: Request) -> RigJob:
             # Parsing takes milliseconds: not on the event loop.
             return await asyncio.to_thread(from_form, body)
     async with backend.arrivals.body(request, backend.settings.max_json_bytes) as body:
-        return await parsed(body, from_json)
+        return await parsed(body, partial(from_json, body))
 
 
 async def read_rig_job(request: Request) -> RigJob:
@@ -203,7 +172,7 @@ async def _read_batch(request: Request, to_job: ToJob[JobT], *, max_files: int) 
     is_form = checked_media_type(request, (_FORM, _JSON)) == _FORM
     async with backend.arrivals.body(request, max_bytes) as body:
         text, files = await asyncio.to_thread(from_form, body) if is_form else (body, {})
-        return await _ONE_BY_ONE.run(partial(to_job, text, files))
+        return await parsed(text, partial(to_job, text, files))
 
 
 def _no_request_text(form: Form) -> VislocError:

@@ -34,6 +34,10 @@ class LargeChunks(h11.Connection):
         event = super().next_event()
         if isinstance(event, h11.Request):
             self._chunks = self._bytes = 0
+            # h11 looks at the length of heads only while they are not complete.
+            fields = sum(len(name) + len(value) for name, value in event.headers)
+            if len(event.target) + fields > _MAX_HEAD_BYTES:
+                raise h11.RemoteProtocolError("the head is too large")
         elif isinstance(event, h11.Data):
             self._chunks += event.chunk_start
             self._bytes += len(event.data)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.reliability.checks import Check
-from benchmarks.reliability.connections import connections
+from benchmarks.reliability.connections import Strength, connections
 from benchmarks.reliability.heavy_requests import heavy_photos
 from benchmarks.reliability.kills import kill_service, kill_workers
 from benchmarks.reliability.maps import SampleMaps, make_maps
@@ -53,7 +53,7 @@ def test_a_killed_service_comes_back_with_all_that_was_published(
 def test_connections_that_are_idle_slow_or_flooding_shut_nobody_out(
     maps: SampleMaps, tmp_path: Path, tls: bool
 ) -> None:
-    checks = asyncio.run(connections(maps, tmp_path, 1200, 4, limits=[1024], tls=[tls]))
+    checks = asyncio.run(connections(maps, tmp_path, Strength(1200, 4), limits=[1024], tls=[tls]))
     assert broken(checks) == []
 
 

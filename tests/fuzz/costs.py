@@ -9,6 +9,7 @@ Prints a table in Markdown of the worst inputs that were found, as large as they
 from __future__ import annotations
 
 import argparse
+import asyncio
 import io
 import multiprocessing
 import resource
@@ -31,7 +32,7 @@ from PIL import Image
 from service.api import jobs
 from service.api.oscp import GeoPoseRequest
 from service.grpc.messages import rig_job_of
-from service.grpc.slow_clients import readable_or_not
+from service.grpc.reading import reader_of
 from service.http.bodies import max_sequence_values
 from service.http.forms import FormLimits, parse_form
 from service.http.slow_clients import LargeChunks
@@ -262,7 +263,7 @@ def parsers() -> dict[str, Callable[[], Parser]]:
             (crlf, b"--b", b"-", b"\r", form, b'name="', b";", b"\0", b": "),
         ),
         "protobuf of a rig": lambda: Parser(
-            "on the event loop",
+            "in a thread",
             batch,
             _read_protobuf,
             (
@@ -296,9 +297,9 @@ _KINDS = ("JPEG", "PNG", "WEBP", "TIFF", "AVIF")
 
 
 def _read_protobuf(data: bytes) -> None:
-    message = readable_or_not(pb2.LocalizeRigRequest.FromString)(data)
-    if isinstance(message, pb2.LocalizeRigRequest):
-        rig_job_of(message, _LIMITS)
+    reader = reader_of(pb2.LocalizeRigRequest.FromString)
+    assert reader is not None
+    rig_job_of(asyncio.run(reader(data).read()), _LIMITS)
 
 
 def _in_child(make: Callable[[], Parser], seconds: float, seed: int, answer: Connection) -> None:

@@ -27,10 +27,15 @@ def check_json_values(text: str | bytes, max_values: int, field: str = "") -> No
     Raises:
         TooLarge: ``request.too_large``.
     """
+    check_num_values(num_json_values(text), max_values, field)
+
+
+def num_json_values(text: str | bytes) -> int:
+    """Return how many values JSON may have at the most, without parsing it."""
     # Brackets as well: a list within a list within a list has no comma. And quotes, of which a
     # value and its name have four.
     values = sum(_count(text, mark) for mark in ",[{")
-    check_num_values(max(values, _count(text, '"') // 4), max_values, field)
+    return max(values, _count(text, '"') // 4)
 
 
 def check_num_values(values: int, max_values: int, field: str = "") -> None:

@@ -77,7 +77,7 @@ class App(FastAPI):
         async def answer(_: Request) -> Response:
             return Response(self._written, media_type="application/json")
 
-        self.add_route("/openapi.json", answer, include_in_schema=False)
+        self.add_api_route("/openapi.json", answer, include_in_schema=False)
 
     @cached_property
     def _written(self) -> bytes:

@@ -71,7 +71,7 @@ async def geopose(request: Request) -> Response:
     limit = limit_of(request)
     backend.engine.check_room()
     async with backend.arrivals.body(request, backend.settings.max_batch_bytes) as body:
-        asked, job = await parsed(body, partial(_read, settings=backend.settings))
+        asked, job = await parsed(body, partial(_read, body, settings=backend.settings))
     async with within(limit):
         work = _answer(backend, asked, job, request.state.request_id)
         answer = await while_connected(request.receive, work)

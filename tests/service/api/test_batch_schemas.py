@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import json
 from typing import Any
@@ -12,7 +13,7 @@ import pytest
 from service.api import jobs
 from service.api.answers import instant_answer
 from service.grpc.messages import instant_of, rig_job_of, sequence_start_of
-from service.grpc.slow_clients import readable_or_not
+from service.grpc.reading import reader_of
 from service.http.bodies import max_sequence_values
 from service.settings import ServiceSettings
 from service.values import ONLY_SENSOR, Localization, RigJob
@@ -164,10 +165,11 @@ def many_sensors() -> pb2.LocalizeRigRequest:
 def test_a_message_of_more_values_is_refused_before_it_is_parsed(
     message: pb2.LocalizeRigRequest,
 ) -> None:
-    refused = readable_or_not(pb2.LocalizeRigRequest.FromString)(message.SerializeToString())
+    unread = reader_of(pb2.LocalizeRigRequest.FromString)(message.SerializeToString())
 
-    assert isinstance(refused.error, TooLarge)
-    assert (refused.error.code, refused.error.expected) == ("request.too_large", "at most 100000")
+    with pytest.raises(TooLarge) as refused:
+        asyncio.run(unread.read())
+    assert (refused.value.code, refused.value.expected) == ("request.too_large", "at most 100000")
 
 
 # What is said

@@ -200,12 +200,40 @@ def test_who_is_closed_for_another(monkeypatch: pytest.MonkeyPatch) -> None:
 
     assert connections.make_room() == 0
     assert [talk.was_closed for talk in talks] == [False, False, True, False]
-    connections.add(Talk())
+    newest = Talk()
+    connections.add(newest)
     assert connections.make_room() == 0
-    assert answered.was_closed  # its answer is younger than the silence of the other
+    assert newest.was_closed  # it has asked nothing, as most that are idle
+    assert not answered.was_closed
     for talk in talks:
         connections.remove(talk)
-    assert len(connections) == 1
+    assert len(connections) == 0
+
+
+def test_the_longest_idle_of_the_kind_that_has_more_is_closed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("service.http.acceptor._LEAST_IDLE_S", 0.0)
+    answered, silent = [Talk() for _ in range(4)], [Talk() for _ in range(6)]
+    connections = OpenConnections(10)
+    for talk in answered:
+        connections.add(talk)
+        connections.note(talk, in_use=True)
+        connections.note(talk, in_use=False)
+    for talk in silent:
+        connections.add(talk)
+
+    for _ in range(2):  # those that never asked give way to others that have not yet
+        assert connections.make_room() == 0
+        connections.add(Talk())
+    assert [talk.was_closed for talk in silent] == [True, True, False, False, False, False]
+    assert not any(talk.was_closed for talk in answered)
+
+    for talk in silent[2:5]:  # more have been answered now, and hold their places
+        connections.note(talk, in_use=True)
+        connections.note(talk, in_use=False)
+    assert connections.make_room() == 0
+    assert [talk.was_closed for talk in answered] == [True, False, False, False]
 
 
 def test_a_request_that_does_not_come_on_is_closed_when_none_is_idle(

@@ -14,6 +14,7 @@ from starlette.routing import Route
 
 from service.http.envelope import route_of
 from service.http.health import metrics_app
+from service.http.openapi.app import App
 from service.telemetry.logs import UNMATCHED
 from service.telemetry.metrics import Metrics, ServiceState
 from service.telemetry.observer import Observer
@@ -64,6 +65,18 @@ def test_plain_routes_of_starlette_have_templates_too() -> None:
     ask(Starlette(routes=[Route("/a/{b}", endpoint)]), "GET", "/a/c")
 
     assert routes == ["GET /a/{b}"]
+
+
+def test_the_description_of_the_api_has_a_route() -> None:
+    app, routes = App(docs_url=None), []
+    app.openapi_schema = {"openapi": "3.1.0"}
+
+    async def watching(scope: Any, receive: Any, send: Any) -> None:
+        await app(scope, receive, send)
+        routes.append(route_of(scope))
+
+    assert ask(watching, "GET", "/openapi.json").json() == app.openapi_schema
+    assert routes == ["GET /openapi.json"]
 
 
 def test_the_port_of_metrics_answers_nothing_else() -> None:

@@ -3,7 +3,6 @@ from __future__ import annotations
 import asyncio
 import random
 from collections.abc import AsyncGenerator
-from functools import partial
 
 import pytest
 from hypothesis import given
@@ -11,51 +10,11 @@ from hypothesis import strategies as st
 from starlette.datastructures import Headers, UploadFile
 from starlette.formparsers import MultiPartException, MultiPartParser
 
-from service.http import bodies
 from service.http.forms import Form, FormLimits, parse_form
 from visloc.errors import InvalidInput
 
 BOUNDARY = b"--x7Y"
 LIMITS = FormLimits(max_files=2, max_texts=2, max_text_bytes=2048)
-
-
-class Clock:
-    """A time that only parsing and resting move on."""
-
-    def __init__(self) -> None:
-        self.now = 100.0
-        self.rests: list[float] = []
-
-    def rest(self, seconds: float) -> None:
-        self.rests.append(seconds)
-        self.now += seconds
-
-
-def test_parsing_rests_between_texts_for_as_long_as_it_took(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    clock = Clock()
-    monkeypatch.setattr(bodies, "monotonic", lambda: clock.now)
-    monkeypatch.setattr(bodies, "sleep", clock.rest)
-    parser = bodies._OneByOne()
-
-    def job(text: str) -> str:
-        clock.now += 0.25
-        if text == "wrong":
-            raise InvalidInput("request.malformed", "not JSON")
-        return text
-
-    async def play() -> None:
-        assert await parser.run(partial(job, "first")) == "first"
-        with pytest.raises(InvalidInput):
-            await parser.run(partial(job, "wrong"))
-        assert await parser.run(partial(job, "third")) == "third"
-        assert clock.rests == [0.25, 0.25]
-        clock.now += 10.0
-        assert await parser.run(partial(job, "after a while")) == "after a while"
-        assert clock.rests == [0.25, 0.25]
-
-    asyncio.run(play())
 
 
 def part(name: bytes, content: bytes, filename: bytes | None = None) -> bytes:

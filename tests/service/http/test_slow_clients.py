@@ -308,6 +308,14 @@ def test_together_bodies_take_no_more_than_there_is_room_for(
     wait_until_idle(arrivals)
 
 
+def test_too_long_a_head_is_refused_even_when_it_comes_at_once(
+    server: tuple[int, Arrivals],
+) -> None:
+    with connected(server[0]) as connection:
+        connection.sendall(b"GET /read HTTP/1.1\r\nHost: a\r\nX: " + b"x" * 17_000 + b"\r\n\r\n")
+        assert answer_of(connection).startswith(b"HTTP/1.1 400 ")
+
+
 def test_a_client_that_leaves_gives_back_what_it_held(server: tuple[int, Arrivals]) -> None:
     port, arrivals = server
     with connected(port) as connection:

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import httpx
 
@@ -72,7 +73,7 @@ def balanced(
     maps_dirs: Sequence[Path | str],
     work: Path,
     environment: Mapping[str, str] | None = None,
-    **settings: object,
+    **settings: Any,
 ) -> Iterator[Balanced]:
     """Run a replica for each folder or URL of maps, and a balancer before them.
 
