@@ -26,9 +26,11 @@ from mapping.methods.intrinsics import (
     notes_on,
     origin_of,
 )
+from mapping.methods.look_alikes import without_look_alikes
 from mapping.methods.matching import Matches, Verification, find_fixed, match_pairs
-from mapping.methods.model_stage import believed_pairs, make_model, with_latecomers
-from mapping.methods.pieces import MIN_PHOTOS, models_beside
+from mapping.methods.model_stage import make_model, with_latecomers, without_poses
+from mapping.methods.pair_agreement import doubts_about_poses
+from mapping.methods.pieces import models_beside
 from mapping.methods.scenes import find_pairs, make_scene
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.methods.sparse_model import MAPPER_CONFIGS, SparseModel
@@ -38,6 +40,7 @@ from mapping.stages.landmarks import MadeLandmarks, View, assemble_landmarks
 from mapping.stages.photos import MappingPhoto, some
 from mapping.stages.work_folder import key_of
 from visloc.archive import Anchor, GlobalFeatures
+from visloc.archive.schema import Doubt
 from visloc.errors import InvalidInput
 from visloc.geometry import Pose, Similarity
 from visloc.kapture import Dataset
@@ -86,17 +89,18 @@ def landmarks_from_matches(
     matched = match_pairs(context, photos, pairs.rows, verification)
     rigs = known_rigs(dataset, {photo.record.sensor_id for photo in photos})
     model = make_model(context, photos, rigs, *matched, settings)
-    models = [model]
+    models: list[tuple[SparseModel, tuple[Doubt, ...]]] = [(model, ())]
     if settings.estimate_poses:
         look = _Look(context, photos, rigs, pairs.rows, verification, settings)
         models = look.models(model, *matched)
-    notes = (*_notes_on_fixed(photos, fixed), *_notes_on_absent(photos, models))
+    notes = (*_notes_on_fixed(photos, fixed), *_notes_on_absent(photos, [one for one, _ in models]))
     return tuple(
         replace(
             _placed_landmarks(dataset, photos, one, settings, metric=metric, notes=notes),
             pairs=(scene, pairs),
+            doubts=doubts,
         )
-        for one in models
+        for one, doubts in models
     )
 
 
@@ -113,8 +117,10 @@ class _Look:
 
     def models(
         self, model: SparseModel, matches: list[Matches], matches_key: str
-    ) -> list[SparseModel]:
+    ) -> list[tuple[SparseModel, tuple[Doubt, ...]]]:
         """Return a model with more of the photos, and models of the photos that it still lacks.
+
+        With what speaks against the poses of each.
 
         The cameras that the model found help. When many photos found no place, all are mapped anew.
         Else those without one are placed in the model as it is.
@@ -136,10 +142,12 @@ class _Look:
         if None in model.views and not (model.undone or model.on_rigs):
             photos = self.photos if found is None else found
             model = with_latecomers(self.context, photos, model, *of_absent, self.settings)
-        if model.views.count(None) < MIN_PHOTOS:
-            return [model]
-        believed = believed_pairs(self.context, begun, matches)
-        return [model, *models_beside(model, believed, partial(self._of_some, begun, matches_key))]
+        given = without_poses(self.context, begun)
+        # Among some of the photos, fewer matches would be missed: all photos tell more.
+        believed = without_look_alikes(given, matches)
+        beside = models_beside(model, believed, partial(self._of_some, begun, matches_key))
+        error = self.verification.max_error_px
+        return [(one, doubts_about_poses(one, given, believed, error)) for one in (model, *beside)]
 
     def _of_some(
         self,

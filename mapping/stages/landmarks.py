@@ -13,6 +13,7 @@ from pydantic import JsonValue
 from mapping.pairing import Pairs, Scene
 from mapping.stages.imported_points import ImportedPoints
 from visloc.archive import Anchor, Landmarks
+from visloc.archive.schema import Doubt
 from visloc.geometry import Camera, Pose
 from visloc.pose.colmap import project
 
@@ -70,6 +71,7 @@ class MadeLandmarks:
         notes: what was left out, one sentence each.
         imported: the points of an imported reconstruction whose photos were matched again.
         pairs: the matched pairs, with their scene.
+        doubts: what speaks against putting a map of them into use by itself.
     """
 
     photos: NDArray[np.int64]
@@ -83,6 +85,7 @@ class MadeLandmarks:
     rig_scale: float | None = 1.0
     imported: ImportedPoints | None = None
     pairs: tuple[Scene, Pairs] | None = None
+    doubts: tuple[Doubt, ...] = ()
 
 
 def assemble_landmarks(
