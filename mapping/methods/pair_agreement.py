@@ -23,7 +23,7 @@ _LEAST_FITTING = 0.4
 _ABOUT = 0.01
 # A model is in doubt when so many pairs and a larger part of them than this contradict its poses.
 # Measured: docs/decisions/0040-moving-things.md.
-_LEAST_PAIRS, _MOST_CONTRADICTED = 4, 0.05
+_LEAST_PAIRS, _MOST_CONTRADICTED = 4, 0.03
 _MAX_NAMES = 100
 
 

@@ -18,7 +18,6 @@ from pydantic import JsonValue
 from mapping.frames.anchor import align_positions, known_positions
 from mapping.frames.anchor_error import place_error
 from mapping.methods.colmap_scene import Rigs
-from mapping.methods.fixed_things import Mask
 from mapping.methods.intrinsics import (
     CAMERAS,
     CameraOrigin,
@@ -27,7 +26,7 @@ from mapping.methods.intrinsics import (
     origin_of,
 )
 from mapping.methods.look_alikes import without_look_alikes
-from mapping.methods.matching import Matches, Verification, find_fixed, match_pairs
+from mapping.methods.matching import Matches, Verification, find_fixed, match_pairs, outside_fixed
 from mapping.methods.model_stage import make_model, with_latecomers, without_poses
 from mapping.methods.pair_agreement import doubts_about_poses
 from mapping.methods.pieces import models_beside
@@ -35,6 +34,7 @@ from mapping.methods.scenes import find_pairs, make_scene
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.methods.sparse_model import MAPPER_CONFIGS, SparseModel
 from mapping.progress import one_step
+from mapping.stages.camera_mask import CameraMask
 from mapping.stages.context import BuildContext
 from mapping.stages.landmarks import MadeLandmarks, View, assemble_landmarks
 from mapping.stages.photos import MappingPhoto, some
@@ -85,7 +85,7 @@ def landmarks_from_matches(
         poses_known=not settings.estimate_poses,
     )
     fixed = find_fixed(context, photos, pairs.rows, verification)
-    verification = replace(verification, fixed=fixed)
+    context = outside_fixed(context, photos, fixed)
     matched = match_pairs(context, photos, pairs.rows, verification)
     rigs = known_rigs(dataset, {photo.record.sensor_id for photo in photos})
     model = make_model(context, photos, rigs, *matched, settings)
@@ -99,6 +99,7 @@ def landmarks_from_matches(
             _placed_landmarks(dataset, photos, one, settings, metric=metric, notes=notes),
             pairs=(scene, pairs),
             doubts=doubts,
+            fixed=fixed,
         )
         for one, doubts in models
     )
@@ -253,14 +254,16 @@ def _placed_landmarks(
     )
 
 
-def _notes_on_fixed(photos: Sequence[MappingPhoto], fixed: Mapping[str, Mask]) -> tuple[str, ...]:
+def _notes_on_fixed(
+    photos: Sequence[MappingPhoto], fixed: Mapping[str, CameraMask]
+) -> tuple[str, ...]:
     """Return a note for each camera with something fixed to its picture."""
     notes = []
     for sensor, mask in fixed.items():
         names = [photo.name for photo in photos if photo.record.sensor_id == sensor]
         notes.append(
-            f"about {mask.mean():.0%} of the picture keeps its pixels while the rest moves (part "
-            "of a vehicle, a logo, dirt on the lens?); its matches were not used, in "
+            "something keeps its pixels while the rest moves (part of a vehicle, a logo, dirt on "
+            f"the lens?); about {mask.mean():.0%} of the picture, with its edge, was not used, in "
             f"{len(names)} photos: {some(names)}"
         )
     return tuple(notes)
