@@ -41,7 +41,7 @@ from mapping.importers.dataset import write_imported
 from mapping.importers.images import read as read_photos
 from mapping.methods.extending import with_late_photos
 from mapping.methods.look_alikes import without_look_alikes
-from mapping.methods.matching import Matches, Verification, find_fixed, match_pairs
+from mapping.methods.matching import Matches, Verification, find_fixed, match_pairs, outside_fixed
 from mapping.methods.pieces import models_beside
 from mapping.methods.scenes import find_pairs, make_scene
 from mapping.methods.sfm_settings import SfmSettings
@@ -134,9 +134,9 @@ def matched(
         pairs = find_pairs(make_scene(dataset, photos, described, settings), settings)
         verification = Verification(CONFIG.filter_max_reproj_error, CONFIG.min_num_matches, False)
         fixed = find_fixed(context, photos, pairs.rows, verification)
-        verification = replace(verification, fixed=fixed)
+        context = outside_fixed(context, photos, fixed)
         matches, _ = match_pairs(context, photos, pairs.rows, verification)
-        found = [source.read(photo) for photo in photos]
+        found = [context.features.read(photo) for photo in photos]
         given = [
             SfmPhoto(
                 photo.name,

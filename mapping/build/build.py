@@ -53,7 +53,8 @@ from mapping.stages.previews import keep_photos
 from mapping.stages.publishing import PAIRS
 from mapping.stages.resolution import at_one_resolution
 from mapping.stages.work_folder import WorkFolder, exclusive
-from visloc.archive import GlobalFeatures, MapStore
+from visloc.archive import GlobalFeatures, Map, MapStore
+from visloc.archive.schema import Doubt
 from visloc.errors import refuse
 from visloc.features.backends.choice import choose_inference
 from visloc.features.local.readymade import is_ready_made
@@ -302,6 +303,12 @@ class _Job:
                 write_pairs(folder / PAIRS, *made.pairs)
             if made.imported is not None:
                 made.imported.write(folder)
-            version = write_content(folder, content, map_id, left_out, self.examine)
+            version = write_content(
+                folder, content, map_id, left_out, partial(self._more_doubts, made)
+            )
             wrote(sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()))
         return WrittenMap(folder, map_id, version, len(placed))
+
+    def _more_doubts(self, made: MadeLandmarks, opened: Map) -> tuple[Doubt, ...]:
+        """Return what speaks against a map beside its own test."""
+        return (*made.doubts, *(self.examine(opened) if self.examine is not None else ()))

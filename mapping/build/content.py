@@ -75,6 +75,7 @@ def photo_content(
         names: n names of these photos in the map.
     """
     placed = [photos[row] for row in made.photos]
+    features = features.outside(made.fixed)
 
     def descriptors() -> Iterator[NDArray[np.float32]]:
         for photo, rows in zip(placed, made.rows, strict=True):

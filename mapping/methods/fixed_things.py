@@ -19,15 +19,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_closing
+from scipy.ndimage import binary_closing, binary_dilation
 
 from mapping.methods.two_views import fits_two_views
+from mapping.stages.camera_mask import CameraMask, cells_of, shape_of
 from visloc.geometry import Camera
 
-Mask = NDArray[np.bool_]
-"""Cells (rows, columns) of a camera's picture."""
-# Cells along the longer side of a picture.
-_CELLS = 24
 # Matches keep their pixel when they move by less than this part of the longer side, or this many
 # pixels.
 _STILL_SHARE, _STILL_PX = 0.0025, 1.5
@@ -57,7 +54,7 @@ class Tally:
     @classmethod
     def of(cls, camera: Camera) -> Tally:
         """Return an empty one."""
-        return cls(*(np.zeros(_shape(camera), np.int64) for _ in range(3)))
+        return cls(*(np.zeros(shape_of(camera), np.int64) for _ in range(3)))
 
     def add(
         self,
@@ -87,24 +84,27 @@ class Tally:
         if moved.sum() < _LEAST_MOVED:
             return
         for pixels in (pixels_a, pixels_b):
-            np.add.at(self.moved, _cells(camera, pixels[moved]), 1)
-            np.add.at(self.against, _cells(camera, pixels[against]), 1)
-        self.pairs[_cells(camera, pixels_a[against])] += 1
+            np.add.at(self.moved, cells_of(camera, pixels[moved]), 1)
+            np.add.at(self.against, cells_of(camera, pixels[against]), 1)
+        self.pairs[cells_of(camera, pixels_a[against])] += 1
 
     def __add__(self, other: Tally) -> Tally:
         return Tally(
             self.against + other.against, self.pairs + other.pairs, self.moved + other.moved
         )
 
-    def mask(self) -> Mask | None:
-        """Return the cells that show something fixed to the picture, if any do."""
+    def mask(self) -> CameraMask | None:
+        """Return the cells that show something fixed to the picture, if any, and those beside."""
         fixed = (self.pairs >= _LEAST_PAIRS) & (self.against > _TIMES * self.moved)
         free = self.moved > _TIMES_FREE * self.against
         told = self.moved + self.against > 0
         if not fixed.any() or free.sum() < _LEAST_FREE * told.sum():
             return None
         # Few matches tell of cells between others that are masked: they show the same thing.
-        return np.asarray(binary_closing(np.pad(fixed, 1), np.ones((3, 3), dtype=bool))[1:-1, 1:-1])
+        around = np.ones((3, 3), dtype=bool)
+        closed = binary_closing(np.pad(fixed, 1), around)[1:-1, 1:-1]
+        # Its edge crosses cells beside it, and keypoints there are described by part of it.
+        return np.asarray(binary_dilation(closed, around))
 
 
 def some_keep_their_pixel(
@@ -114,29 +114,8 @@ def some_keep_their_pixel(
     return bool(_keep_their_pixel(camera, pixels_a, pixels_b).sum() >= _LEAST_STILL)
 
 
-def are_masked(camera: Camera, mask: Mask, pixels: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Tell which pixels (n, 2) of a camera's photos lie in masked cells."""
-    return np.asarray(mask[_cells(camera, pixels)])
-
-
 def _keep_their_pixel(
     camera: Camera, pixels_a: NDArray[np.floating], pixels_b: NDArray[np.floating]
 ) -> NDArray[np.bool_]:
     limit = max(_STILL_PX, _STILL_SHARE * max(camera.width, camera.height))
     return np.asarray(np.linalg.norm(pixels_a - pixels_b, axis=1) <= limit)
-
-
-def _shape(camera: Camera) -> tuple[int, int]:
-    size = max(camera.width, camera.height) / _CELLS
-    return max(1, round(camera.height / size)), max(1, round(camera.width / size))
-
-
-def _cells(
-    camera: Camera, pixels: NDArray[np.floating]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the rows and columns (n,) of the cells in which pixels (n, 2) lie."""
-    rows, columns = _shape(camera)
-    x, y = np.asarray(pixels, np.float64).T
-    row = np.clip(y / camera.height * rows, 0, rows - 1)
-    column = np.clip(x / camera.width * columns, 0, columns - 1)
-    return row.astype(np.int64), column.astype(np.int64)

@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.methods.fixed_things import Mask, Tally, are_masked, some_keep_their_pixel
+from mapping.methods.fixed_things import Tally, some_keep_their_pixel
 from mapping.methods.two_views import fits_two_views
+from mapping.stages.camera_mask import CameraMask
 from mapping.stages.context import BuildContext
 from mapping.stages.landmarks import View
 from mapping.stages.local_features import LocalFeaturesSource
@@ -31,7 +32,7 @@ from visloc.matching.verification import epipolar_errors
 from visloc.pose.colmap import normalized_rays
 
 # Raised when the code of a stage here changes what comes out.
-_REVISION = {"matches": 2, "fixed_things": 1, "verified": 3}
+_REVISION = {"matches": 2, "fixed_things": 1, "verified": 4}
 # Partners of a photo with which it is asked what is fixed to the picture: enough for all photos
 # together.
 _MOST_ASKED = 8
@@ -60,13 +61,11 @@ class Verification:
         max_error_px: largest distance to the epipolar line, pixels.
         min_matches: fewest verified matches of a pair; a pair with fewer is dropped.
         poses_known: verify with the poses of the photos; otherwise by two-view geometry.
-        fixed: masks of what is fixed to the picture, by sensor. No match there is right.
     """
 
     max_error_px: float
     min_matches: int
     poses_known: bool
-    fixed: Mapping[str, Mask] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,7 +81,7 @@ def find_fixed(
     photos: Sequence[MappingPhoto],
     pairs: NDArray[np.int64],
     verification: Verification,
-) -> dict[str, Mask]:
+) -> dict[str, CameraMask]:
     """Match pairs (m, 2) of photos, and find what is fixed to the picture.
 
     Returns:
@@ -100,6 +99,21 @@ def find_fixed(
     return {sensor: mask for sensor, mask in masks.items() if mask is not None}
 
 
+def outside_fixed(
+    context: BuildContext, photos: Sequence[MappingPhoto], fixed: Mapping[str, CameraMask]
+) -> BuildContext:
+    """Find new features outside what is fixed to the picture, by sensor, and return their context.
+
+    It may have had most of the keypoints that a photo may have.
+    """
+    if not fixed:
+        return context
+    context = replace(context, features=context.features.outside(fixed))
+    masked = [photo for photo in photos if photo.record.sensor_id in fixed]
+    context.run("local features", context.features.prepare, masked)
+    return context
+
+
 def match_pairs(
     context: BuildContext,
     photos: Sequence[MappingPhoto],
@@ -115,7 +129,7 @@ def match_pairs(
     groups = [(first, seconds) for first, seconds, _ in found_groups]
     partners = [group for _, _, group in found_groups]
     task = _MatchTask(context.work, context.features, verification, context.matches)
-    # Usually, what is fixed was looked for among the same matches.
+    # Usually, what is fixed was looked for among the same matches, and nothing was found.
     missing = [group for group in partners if not context.work.has(task.matches_key(group))]
     if missing:
         context.run("matches", task.match, missing)
@@ -180,14 +194,6 @@ class _MatchTask:
             max_error_px=self.verification.max_error_px,
             min_matches=self.verification.min_matches,
             poses_known=self.verification.poses_known,
-            fixed=[
-                self.verification.fixed[sensor].tolist()
-                if (sensor := photo.record.sensor_id) in self.verification.fixed
-                else None
-                for photo in (group.photo, *group.partners)
-            ]
-            if self.verification.fixed
-            else None,
             views=[
                 [
                     *camera_values(photo.camera),
@@ -271,12 +277,8 @@ class _MatchTask:
             matches = _rows_by_partner(self.work.read(self.matches_key(group)))
             own = self.features.read(group.photo).keypoints
             found = []
-            for partner, matched in zip(group.partners, matches, strict=True):
+            for partner, rows in zip(group.partners, matches, strict=True):
                 theirs = self.features.read(partner).keypoints
-                rows = matched[
-                    ~self._are_fixed(group.photo, own[matched[:, 0]])
-                    & ~self._are_fixed(partner, theirs[matched[:, 1]])
-                ]
                 a, b = own[rows[:, 0]], theirs[rows[:, 1]]
                 good = self._verified(group.photo, partner, a, b)
                 kept = rows[good]
@@ -285,12 +287,6 @@ class _MatchTask:
 
         if not self.work.has(self.verified_key(group)):
             self.work.get(self.verified_key(group), compute)
-
-    def _are_fixed(self, photo: MappingPhoto, pixels: NDArray[np.float32]) -> NDArray[np.bool_]:
-        mask = self.verification.fixed.get(photo.record.sensor_id)
-        if mask is None:
-            return np.zeros(len(pixels), dtype=bool)
-        return are_masked(photo.camera, mask, pixels)
 
     def _verified(
         self,

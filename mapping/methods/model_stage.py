@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from mapping.methods.colmap_scene import Rigs
 from mapping.methods.extending import with_late_photos
 from mapping.methods.intrinsics import Doubt
-from mapping.methods.look_alikes import without_look_alikes
 from mapping.methods.matching import Matches, camera_values, pose_values
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.methods.sparse_model import MAPPER_CONFIGS, SfmPhoto, SparseModel
@@ -84,15 +83,9 @@ def with_latecomers(
     return _from_item(context.work.read(key), photos)
 
 
-def believed_pairs(
-    context: BuildContext, photos: Sequence[MappingPhoto], matches: Sequence[Matches]
-) -> list[Matches]:
-    """Return the pairs of photos without poses that seem to show one place.
-
-    Among some of the photos, fewer matches would be missed: all photos tell more.
-    """
-    given = [_given(context.features, photo, posed=False) for photo in photos]
-    return without_look_alikes(given, matches)
+def without_poses(context: BuildContext, photos: Sequence[MappingPhoto]) -> list[SfmPhoto]:
+    """Return the mapper's view of photos whose poses are estimated."""
+    return [_given(context.features, photo, posed=False) for photo in photos]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,7 +18,6 @@ from pydantic import JsonValue
 from mapping.frames.anchor import align_positions, known_positions
 from mapping.frames.anchor_error import place_error
 from mapping.methods.colmap_scene import Rigs
-from mapping.methods.fixed_things import Mask
 from mapping.methods.intrinsics import (
     CAMERAS,
     CameraOrigin,
@@ -26,18 +25,22 @@ from mapping.methods.intrinsics import (
     notes_on,
     origin_of,
 )
-from mapping.methods.matching import Matches, Verification, find_fixed, match_pairs
-from mapping.methods.model_stage import believed_pairs, make_model, with_latecomers
-from mapping.methods.pieces import MIN_PHOTOS, models_beside
+from mapping.methods.look_alikes import without_look_alikes
+from mapping.methods.matching import Matches, Verification, find_fixed, match_pairs, outside_fixed
+from mapping.methods.model_stage import make_model, with_latecomers, without_poses
+from mapping.methods.pair_agreement import doubts_about_poses
+from mapping.methods.pieces import models_beside
 from mapping.methods.scenes import find_pairs, make_scene
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.methods.sparse_model import MAPPER_CONFIGS, SparseModel
 from mapping.progress import one_step
+from mapping.stages.camera_mask import CameraMask
 from mapping.stages.context import BuildContext
 from mapping.stages.landmarks import MadeLandmarks, View, assemble_landmarks
 from mapping.stages.photos import MappingPhoto, some
 from mapping.stages.work_folder import key_of
 from visloc.archive import Anchor, GlobalFeatures
+from visloc.archive.schema import Doubt
 from visloc.errors import InvalidInput
 from visloc.geometry import Pose, Similarity
 from visloc.kapture import Dataset
@@ -85,21 +88,23 @@ def landmarks_from_matches(
         poses_known=not settings.estimate_poses,
     )
     fixed = find_fixed(context, photos, pairs.rows, verification)
-    verification = replace(verification, fixed=fixed)
+    context = outside_fixed(context, photos, fixed)
     matched = match_pairs(context, photos, pairs.rows, verification)
     rigs = known_rigs(dataset, {photo.record.sensor_id for photo in photos})
     model = make_model(context, photos, rigs, *matched, settings)
-    models = [model]
+    models: list[tuple[SparseModel, tuple[Doubt, ...]]] = [(model, ())]
     if settings.estimate_poses:
         look = _Look(context, photos, rigs, pairs.rows, verification, settings)
         models = look.models(model, *matched)
-    notes = (*_notes_on_fixed(photos, fixed), *_notes_on_absent(photos, models))
+    notes = (*_notes_on_fixed(photos, fixed), *_notes_on_absent(photos, [one for one, _ in models]))
     return tuple(
         replace(
             _placed_landmarks(dataset, photos, one, settings, metric=metric, notes=notes),
             pairs=(scene, pairs),
+            doubts=doubts,
+            fixed=fixed,
         )
-        for one in models
+        for one, doubts in models
     )
 
 
@@ -116,8 +121,10 @@ class _Look:
 
     def models(
         self, model: SparseModel, matches: list[Matches], matches_key: str
-    ) -> list[SparseModel]:
+    ) -> list[tuple[SparseModel, tuple[Doubt, ...]]]:
         """Return a model with more of the photos, and models of the photos that it still lacks.
+
+        With what speaks against the poses of each.
 
         The cameras that the model found help. When many photos found no place, all are mapped anew.
         Else those without one are placed in the model as it is.
@@ -139,10 +146,12 @@ class _Look:
         if None in model.views and not (model.undone or model.on_rigs):
             photos = self.photos if found is None else found
             model = with_latecomers(self.context, photos, model, *of_absent, self.settings)
-        if model.views.count(None) < MIN_PHOTOS:
-            return [model]
-        believed = believed_pairs(self.context, begun, matches)
-        return [model, *models_beside(model, believed, partial(self._of_some, begun, matches_key))]
+        given = without_poses(self.context, begun)
+        # Among some of the photos, fewer matches would be missed: all photos tell more.
+        believed = without_look_alikes(given, matches)
+        beside = models_beside(model, believed, partial(self._of_some, begun, matches_key))
+        error = self.verification.max_error_px
+        return [(one, doubts_about_poses(one, given, believed, error)) for one in (model, *beside)]
 
     def _of_some(
         self,
@@ -248,14 +257,16 @@ def _placed_landmarks(
     )
 
 
-def _notes_on_fixed(photos: Sequence[MappingPhoto], fixed: Mapping[str, Mask]) -> tuple[str, ...]:
+def _notes_on_fixed(
+    photos: Sequence[MappingPhoto], fixed: Mapping[str, CameraMask]
+) -> tuple[str, ...]:
     """Return a note for each camera with something fixed to its picture."""
     notes = []
     for sensor, mask in fixed.items():
         names = [photo.name for photo in photos if photo.record.sensor_id == sensor]
         notes.append(
-            f"about {mask.mean():.0%} of the picture keeps its pixels while the rest moves (part "
-            "of a vehicle, a logo, dirt on the lens?); its matches were not used, in "
+            "something keeps its pixels while the rest moves (part of a vehicle, a logo, dirt on "
+            f"the lens?); about {mask.mean():.0%} of the picture, with its edge, was not used, in "
             f"{len(names)} photos: {some(names)}"
         )
     return tuple(notes)

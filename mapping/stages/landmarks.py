@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from pydantic import JsonValue
 
 from mapping.pairing import Pairs, Scene
+from mapping.stages.camera_mask import CameraMask
 from mapping.stages.imported_points import ImportedPoints
 from visloc.archive import Anchor, Landmarks
+from visloc.archive.schema import Doubt
 from visloc.geometry import Camera, Pose
 from visloc.pose.colmap import project
 
@@ -70,6 +72,9 @@ class MadeLandmarks:
         notes: what was left out, one sentence each.
         imported: the points of an imported reconstruction whose photos were matched again.
         pairs: the matched pairs, with their scene.
+        doubts: what speaks against putting a map of them into use by itself.
+        fixed: masks of what is fixed to the picture, by sensor; ``rows`` are those of the features
+            outside them (``LocalFeaturesSource.outside``).
     """
 
     photos: NDArray[np.int64]
@@ -83,6 +88,8 @@ class MadeLandmarks:
     rig_scale: float | None = 1.0
     imported: ImportedPoints | None = None
     pairs: tuple[Scene, Pairs] | None = None
+    doubts: tuple[Doubt, ...] = ()
+    fixed: Mapping[str, CameraMask] = field(default_factory=dict)
 
 
 def assemble_landmarks(

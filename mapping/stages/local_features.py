@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
+from mapping.stages.camera_mask import CameraMask, are_masked
 from mapping.stages.networks import Networks, refuse_other_computing
 from mapping.stages.photos import MappingPhoto
 from mapping.stages.work_folder import Item, WorkFolder, key_of
@@ -34,6 +35,9 @@ from visloc.types import Fingerprint, LocalFeatures
 _REVISION = 2
 # Name of an array beside those of the local features of a photo.
 _TURN = "turn"
+# Where something is fixed to the picture, so many times the keypoints are found, and those of them
+# that lie on it are dropped: it may have most of the strongest.
+_TIMES_FOUND = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +50,7 @@ class ExtractedFeatures:
     Attributes:
         name: of the extractor, in ``visloc.features.LOCAL_FEATURES``.
         max_keypoints: strongest ones kept per photo.
+        fixed: masks of what is fixed to the picture, by sensor; no keypoint is taken there.
     """
 
     work: WorkFolder
@@ -55,8 +60,14 @@ class ExtractedFeatures:
     fingerprint: Fingerprint
     descriptor_dim: int
     computed_with: str
+    fixed: Mapping[str, CameraMask] = field(default_factory=dict)
+
+    def outside(self, fixed: Mapping[str, CameraMask]) -> ExtractedFeatures:
+        """Return the source of as many features outside masks, by sensor."""
+        return replace(self, fixed=fixed)
 
     def key(self, photo: MappingPhoto) -> str:
+        fixed = self.fixed.get(photo.record.sensor_id)
         return key_of(
             "local_features",
             _REVISION,
@@ -67,6 +78,7 @@ class ExtractedFeatures:
             max_keypoints=self.max_keypoints,
             **({} if photo.mask_sha256 is None else {"mask": photo.mask_sha256}),
             **({} if photo.feature_size is None else {"feature_size": photo.feature_size}),
+            **({} if fixed is None else {"fixed": [_TIMES_FOUND, fixed.tolist()]}),
         )
 
     def prepare(self, photo: MappingPhoto) -> None:
@@ -93,9 +105,11 @@ class ExtractedFeatures:
         extractor = self.networks.extractor(self.name)
         refuse_other_computing(self.name, self.computed_with, extractor.computed_with)
         pixels = photo.read()
-        local, _ = extract_features(
-            pixels, extractor, max_keypoints=self.max_keypoints, framing=Framing(photo.feature_size)
-        )
+        most, framing = self.max_keypoints, Framing(photo.feature_size)
+        if photo.record.sensor_id in self.fixed:
+            most *= _TIMES_FOUND
+        local, _ = extract_features(pixels, extractor, max_keypoints=most, framing=framing)
+        local = _outside(local, photo, self.fixed).strongest(self.max_keypoints)
         return asdict(local) | {_TURN: np.array(turn_of(pixels.exif_orientation))}
 
 
@@ -105,11 +119,13 @@ class ReadyMadeFeatures:
 
     Attributes:
         origin: of the keypoints' coordinates.
+        fixed: masks of what is fixed to the picture, by sensor; features there are dropped.
     """
 
     keypoints: FeatureSet
     descriptors: FeatureSet
     origin: PixelOrigin
+    fixed: Mapping[str, CameraMask] = field(default_factory=dict)
     _keys: dict[str, str] = field(default_factory=dict, repr=False)
 
     @property
@@ -128,6 +144,10 @@ class ReadyMadeFeatures:
     def max_keypoints(self) -> int:
         """Most keypoints that a photo may have; all of them are taken."""
         return MAX_READY_MADE_KEYPOINTS
+
+    def outside(self, fixed: Mapping[str, CameraMask]) -> ReadyMadeFeatures:
+        """Return the source of the features outside masks, by sensor."""
+        return ReadyMadeFeatures(self.keypoints, self.descriptors, self.origin, fixed)
 
     def has(self, image_path: str) -> bool:
         return self.keypoints.has(image_path) and self.descriptors.has(image_path)
@@ -164,7 +184,7 @@ class ReadyMadeFeatures:
         size = (photo.camera.width, photo.camera.height)
         rows = read_local(self.keypoints, self.descriptors, photo.name, size, self.origin)
         with errors_in(self.descriptors, photo):
-            return to_local_features(*rows)
+            return _outside(to_local_features(*rows), photo, self.fixed)
 
     def turn(self, _photo: MappingPhoto) -> int:
         """Unknown; the photo is assumed to be as stored."""
@@ -175,8 +195,15 @@ LocalFeaturesSource = ExtractedFeatures | ReadyMadeFeatures
 """Source of the local features of mapping photos; it is sent to workers.
 
 ``key`` identifies a photo's features in the keys of results that depend on them. ``prepare`` makes
-reading them quick.
+reading them quick. ``outside`` leaves out what is fixed to the picture.
 """
+
+
+def _outside(
+    local: LocalFeatures, photo: MappingPhoto, fixed: Mapping[str, CameraMask]
+) -> LocalFeatures:
+    mask = fixed.get(photo.record.sensor_id)
+    return local if mask is None else local.of(~are_masked(photo.camera, mask, local.keypoints))
 
 
 def local_features_source(

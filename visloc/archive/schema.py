@@ -282,8 +282,8 @@ class Doubt(Record):
     """A reason why a version was not put into use by itself.
 
     Attributes:
-        kind: ``own_test``, ``left_out``, ``pieces`` or ``places``; of a capture also ``order`` or
-            ``scale``.
+        kind: ``own_test``, ``left_out``, ``pieces``, ``places`` or ``matches``; of a capture also
+            ``order`` or ``scale``.
         message: a sentence for people.
         photos: names of those that it is about, or of the first of them.
     """

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mapping.methods.fixed_things import Mask, Tally, are_masked
+from mapping.methods.fixed_things import Tally
+from mapping.stages.camera_mask import CameraMask, are_masked
 from visloc.geometry import Camera, Pose
 from visloc.pose.colmap import project
 
@@ -21,6 +22,7 @@ HILLS = RANDOM.uniform([-4e5, -3e5, 5e5], [4e5, 3e5, 6e5], (300, 3))
 # Left, top, right and bottom of what is fixed to the picture.
 BONNET = (160, 380, 480, 480)
 NUM_FIXED = 200
+CELL_PX = 640 / 24
 
 
 def turned(yaw_deg: float, center: Sequence[float] = (0, 0, 0)) -> Pose:
@@ -43,7 +45,7 @@ def mask_of(
     fixed: bool = False,
     calibrated: bool = True,
     moving: NDArray[np.float64] | None = None,
-) -> Mask | None:
+) -> CameraMask | None:
     """The mask of photos whose keypoints are off by 0.3 pixels; ``moving`` is where points are."""
     noise = np.random.default_rng(0)
     on_it = noise.uniform(BONNET[:2], BONNET[2:], (NUM_FIXED, 2))
@@ -77,8 +79,11 @@ def test_what_is_fixed_to_the_picture_is_masked_and_nothing_else(
     left, top, right, bottom = BONNET
     inner = RANDOM.uniform((left + 5, top + 5), (right - 5, bottom - 5), (500, 2))
     assert are_masked(CAMERA, mask, inner).mean() > 0.95
-    share = (right - left) * (bottom - top) / (640 * 480)
-    assert share * 0.9 < mask.mean() < share * 1.4
+    # With a cell around it, and cells that it covers in part.
+    most = (right - left + 4 * CELL_PX) * (bottom - top + 2 * CELL_PX) / (640 * 480)
+    assert mask.mean() <= most
+    above = RANDOM.uniform((0, 0), (640, top - 2 * CELL_PX - 1), (500, 2))
+    assert not are_masked(CAMERA, mask, above).any()
 
 
 @pytest.mark.parametrize("calibrated", [True, False])
