@@ -104,9 +104,10 @@ def outside_fixed(
 ) -> BuildContext:
     """Find new features outside what is fixed to the picture, by sensor, and return their context.
 
-    It may have had most of the keypoints that a photo may have.
+    It may have had most of the keypoints that a photo may have. Matches of another program name
+    keypoints by their rows, so these stay as they are.
     """
-    if not fixed:
+    if not fixed or context.matches is not None:
         return context
     context = replace(context, features=context.features.outside(fixed))
     masked = [photo for photo in photos if photo.record.sensor_id in fixed]
