@@ -24,11 +24,11 @@ from visloc.types import Near
 
 logger = logging.getLogger(__name__)
 
-# How long a version that could not be opened is left alone before it is tried again.
+# Time after which a version that could not be opened is tried again.
 RETRY_AFTER_S = 10.0
-# How often the store is asked for new versions, besides by requests.
+# Time between two questions to the store for new versions; requests ask as well.
 FOLLOW_S = 1.0
-# How often a version is checked for requests that still use it, and the longest time before it is
+# Time between two checks whether requests still use a version, and the time after which it is
 # closed anyway.
 _UNUSED_POLL_S = 0.05
 _FORGET_LIMIT_S = 600.0
@@ -36,11 +36,11 @@ _FORGET_LIMIT_S = 600.0
 
 @dataclass(frozen=True, slots=True)
 class _Refused:
-    """A version that is current in the store and could not be loaded.
+    """A version that is current in the store but could not be loaded.
 
     Attributes:
         ref: ``id@version``; ``id`` when the store cannot tell which version is current.
-        at: when, by ``perf_counter``.
+        at: time of the attempt, by ``perf_counter``.
     """
 
     ref: str
@@ -54,7 +54,7 @@ class _Refused:
 
 @dataclass(slots=True, eq=False)
 class _Served:
-    """A map: the version in service, and the state of the version that is current in the store."""
+    """The version of a map that is served, and the state of the store's current one."""
 
     version: MapFolder | None = None
     refused: _Refused | None = None
@@ -67,8 +67,8 @@ class _Version:
 
     Attributes:
         folder: None until it is on this machine and read.
-        outline: of a set; None of a map.
-        users: requests under way.
+        outline: of a set; None for a map.
+        users: number of requests that use it.
         is_leaving: it is being deleted.
     """
 
@@ -81,9 +81,9 @@ class _Version:
 class Catalog:
     """Tracks the versions that are served. Used from one event loop; blocking work runs in threads.
 
-    Every request asks the store which version is current, so that a map that was published a moment
-    ago is served without a restart. The new version takes over when a worker process has it open
-    and warm; until then, and when it cannot be opened, the previous one stays in service.
+    Every request asks the store which version is current, so a new map or version is served without
+    a restart. A new version takes over when a worker process has it open and warm. Until then, or
+    if it cannot be opened, the previous version is served.
     """
 
     def __init__(self, store: MapStore, workers: Workers) -> None:
@@ -108,7 +108,8 @@ class Catalog:
     async def load_all(self, max_bytes: int) -> None:
         """Open current maps until ``max_bytes`` are open; requests open the others.
 
-        Sets come first, and the first tiles of sets last. A broken map does not stop the others.
+        Sets are opened first, then maps in no set, then the first tiles of sets. A broken map does
+        not stop the others.
         """
         for ref in await asyncio.to_thread(self.listing.opened_at_start):
             if sum(self._workers.loaded.values()) >= max_bytes:
@@ -163,7 +164,7 @@ class Catalog:
 
     @asynccontextmanager
     async def reading(self, ref: str) -> AsyncIterator[MapFolder]:
-        """Yield ``id@version`` to read in this process; it stays until the block ends."""
+        """Yield ``id@version`` to read in this process; its files stay until the block ends."""
         version = await self._hold(ref)
         try:
             yield version
@@ -188,7 +189,7 @@ class Catalog:
             Conflict: ``map.version_in_use``, ``map.in_set``.
         """
         ref = f"{map_id}@{version}"
-        # A version that answers because the current one cannot be opened is current too.
+        # If the current version cannot be opened, the one that answers instead counts as current.
         others = set(await asyncio.to_thread(self._store.versions, map_id)) - {version}
         if others and self._is_served(ref):
             raise version_in_use(map_id, version, sorted(others))
@@ -220,7 +221,7 @@ class Catalog:
         self.fetcher.close()
 
     async def _take(self, ref: str) -> MapFolder:
-        """Return a map, which stays until it is released."""
+        """Return a map, which stays open until it is released."""
         while True:
             found = ref if "@" in ref else (await self._resolve(ref)).ref
             try:
@@ -231,7 +232,7 @@ class Catalog:
                 # Another version took over meanwhile.
 
     async def _hold(self, ref: str) -> MapFolder:
-        """Return ``id@version``, which stays until it is released."""
+        """Return ``id@version``, which stays open until it is released."""
         version = self._versions.setdefault(ref, _Version())
         if version.is_leaving:
             raise refuse("map.version", "the version is being deleted", field="map", got=ref)
@@ -279,7 +280,7 @@ class Catalog:
         await self._workers.run_everywhere(Vision.forget, ref)
 
     def _served_ref(self, map_id: str) -> str | None:
-        """``id@version`` of what is served of a map; also called in threads."""
+        """Return ``id@version`` of the version of a map that is served; also called in threads."""
         served = self._maps.get(map_id)
         return None if served is None or served.version is None else served.version.ref
 
@@ -287,7 +288,7 @@ class Catalog:
         return self._served_ref(ref.partition("@")[0]) == ref
 
     def _sets_with(self, ref: str) -> list[SetOutline]:
-        """The sets that are served and name a version; also called in threads."""
+        """Return the served sets that name a version; also called in threads."""
         served = [self._versions.get(self._served_ref(one) or "") for one in tuple(self._maps)]
         sets = [one.outline for one in served if one is not None and one.outline is not None]
         return [one for one in sets if any(ref == tile.ref for tile in one.tiles)]
@@ -351,7 +352,7 @@ class Catalog:
                 self._in_background(self._forget(before.ref))
 
     def _refuse(self, map_id: str, current: str, error: VislocError) -> None:
-        """Note that the current version cannot be served."""
+        """Record that the current version cannot be served."""
         served = self._maps.setdefault(map_id, _Served())
         before, known = served.version, served.refused
         served.refused = _Refused(current, error, perf_counter())
@@ -377,7 +378,7 @@ class Catalog:
 
     async def _prepare(self, ref: str) -> MapFolder:
         """Return a version on this machine's disk, and whether it is a set."""
-        # Asked every time: copies of a remote store come and go by their use.
+        # Ask every time: unused copies of a remote store are deleted.
         folder = await self.fetcher.folder(ref)
         version = self._versions.get(ref)
         outline: object = None if version is None else version.outline

@@ -147,21 +147,21 @@ class Engine:
 
     @property
     def photos(self) -> int:
-        """Photos on their own that wait or are being localized."""
+        """Number of single photos that wait or are being localized."""
         return self._photos
 
     @property
     def waiting(self) -> int:
-        """Photos that wait for a worker process, or for room to be decoded for a set of maps."""
+        """Number of photos that wait for a worker process, or for room to be decoded for a set."""
         return self.workers.waiting + self._sets.waiting
 
     @property
     def batches(self) -> int:
-        """Rigs and sequences that are being served."""
+        """Number of rigs and sequences that are being served."""
         return self._batches
 
     async def localize(self, job: RigJob) -> Localization:
-        """Localize a photo on its own, or its features.
+        """Localize a single photo, or its features.
 
         Raises:
             Overloaded: ``server.busy`` when too many photos are waiting.
@@ -232,10 +232,10 @@ class Engine:
     ) -> AsyncGenerator[Localization]:
         """Answer the instants of a sequence in order, each as soon as its answer is final.
 
-        It runs within ``admit_batch``. It takes the next instant only after the caller took the
-        previous answers. A list of instants is checked before any work (in a set of maps, only
-        their order and the names of tiles). With several maps, the answers wait until one map alone
-        explains an instant; that map is kept.
+        Call it within ``admit_batch``. It takes the next instant only after the caller took the
+        previous answers. A list of instants is checked before any work. In a set of maps, only the
+        order of instants and the names of tiles are checked. With several maps, answers wait until
+        only one map explains an instant; that map localizes the rest of the sequence.
 
         Raises:
             InvalidInput: ``sequence.*``, ``rig.*``, ``options.*``, ``priors.*``.
@@ -280,7 +280,7 @@ class Engine:
         return await asyncio.to_thread(self._catalog.listing.describe, ref)
 
     async def upload(self, map_id: str, version: str, chunks: AsyncIterator[bytes]) -> ServedMap:
-        """Publish a packed map, verified and tried, without making it current.
+        """Publish a packed map after it was verified and tried, without making it current.
 
         Raises:
             VislocError: errors of ``Uploads.publish``.

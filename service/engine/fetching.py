@@ -11,12 +11,12 @@ from service.engine.gather import together
 from visloc.archive import MapStore
 from visloc.errors import VislocError
 
-# Maps that are fetched at once.
+# Number of maps that are fetched at the same time.
 _MAX_FETCHES = 4
 
 
 class Fetcher:
-    """Fetches versions of maps, each once for all who wait for it. Used from one event loop."""
+    """Fetches versions of maps, each only once at a time. Used from one event loop."""
 
     def __init__(self, store: MapStore) -> None:
         self._store = store
@@ -25,7 +25,7 @@ class Fetcher:
         self._fetching: dict[str, asyncio.Future[Path]] = {}  # by id@version
 
     async def folder(self, ref: str) -> Path:
-        """Return where ``id@version`` lies on this machine, fetched if need be.
+        """Return the folder of ``id@version`` on this machine; fetch it if necessary.
 
         Raises:
             VislocError: errors of the store.
@@ -42,7 +42,7 @@ class Fetcher:
             def fetched(done: asyncio.Future[Path]) -> None:
                 self._fetching.pop(ref, None)
                 if not done.cancelled():
-                    done.exception()  # seen, also when nobody waits for it any more
+                    done.exception()  # retrieved, even if no caller waits any more
 
             fetching.add_done_callback(fetched)
         return await asyncio.shield(fetching)

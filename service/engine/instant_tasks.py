@@ -15,12 +15,12 @@ from visloc.priors import Priors
 
 
 async def localize_in(workers: Workers, job: RigJob, maps: tuple[MapFolder, ...]) -> Localization:
-    """Localize a photo in one task; the images of a rig each in its own, then all together.
+    """Localize a photo in one task; a rig with a task for each image, and one for all together.
 
     An image of a rig that cannot be used fails alone.
 
     Raises:
-        InvalidInput: ``rig.*``, ``options.*``, ``priors.*``; errors of a photo on its own.
+        InvalidInput: ``rig.*``, ``options.*``, ``priors.*``; errors of a single photo.
         Unavailable: ``server.worker_died``.
     """
     if job.rig is None:

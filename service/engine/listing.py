@@ -16,10 +16,10 @@ from visloc.types import Near
 
 logger = logging.getLogger(__name__)
 
-# Descriptions that stay in memory, about 20 kB each; their arrays stay on disk. All tiles of a set
-# are listed repeatedly.
+# Number of descriptions in memory, about 20 kB each; their arrays stay on disk. There are so many
+# because every listing describes all tiles of a set.
 _MAX_DESCRIBED = MAX_TILES + 1000
-# Tiles of sets that are opened at the start; requests open the others. A set may have thousands.
+# Number of tiles that are opened at the start; requests open the others. A set may have thousands.
 _MAX_TILES_AT_START = 100
 
 
@@ -28,7 +28,7 @@ class Listing:
 
     Args:
         store: where the maps are.
-        served_ref: returns ``id@version`` of what is served of a map; None for nothing.
+        served_ref: returns ``id@version`` of the served version of a map; None if none is served.
     """
 
     def __init__(self, store: MapStore, served_ref: Callable[[str], str | None]) -> None:
@@ -51,7 +51,7 @@ class Listing:
             served = self._served_ref(map_id)
             version = current if served is None else served.partition("@")[2]
             if not current:
-                self._store.current_version(map_id)  # raises what is wrong
+                self._store.current_version(map_id)  # raises the error
         wanted = f"{map_id}@{version}"
         versions = self._store.versions(map_id)
         outline = self._described.get(wanted) if version in versions else None
@@ -84,7 +84,7 @@ class Listing:
         self._described.pop(ref, None)
 
     def searched_near(self, near: Near) -> tuple[str, ...]:
-        """Return the ids of the sets and maps to search in a circle: a set instead of its tiles.
+        """Return the ids of the maps to search in a circle, with sets in place of their tiles.
 
         Raises:
             NotFound: ``map.none_near``.
@@ -93,7 +93,7 @@ class Listing:
         sets, alone = self._sets_and_others()
         found = [one.manifest.id for one in sets if _reaches(one, near)]
         for map_id in alone:
-            with suppress(VislocError):  # an unreadable map is nowhere
+            with suppress(VislocError):  # a map that cannot be read has no place
                 if _reaches(self.describe(map_id).outline, near):
                     found.append(map_id)
         if not found:
@@ -115,8 +115,8 @@ class Listing:
     def opened_at_start(self) -> tuple[str, ...]:
         """Return what to open at the start, in this order.
 
-        First the ids of sets, then of maps that are in none. Tiles come last, each ``id@version``:
-        a set names versions, which need not be current.
+        The ids of sets come first, then those of maps that are in no set. Tiles come last, as
+        ``id@version``, because the versions that a set names need not be current.
         """
         sets, alone = self._sets_and_others()
         tiles = list(dict.fromkeys(tile.ref for one in sets for tile in one.tiles))
@@ -125,7 +125,7 @@ class Listing:
     def _sets_and_others(self) -> tuple[list[SetOutline], list[str]]:
         """Return the sets, and the ids of maps that are in none.
 
-        Sets that are known come first. Their tiles, which may be thousands, are then not read.
+        Known sets come first, so that their tiles, which may be thousands, are not read.
         """
         sets, maps, tiles = list[SetOutline](), list[str](), set[str]()
         for map_id in sorted(self._store.ids(), key=lambda one: one not in self._set_ids):
@@ -134,7 +134,7 @@ class Listing:
             try:
                 outline = self.describe(map_id).outline
             except VislocError:
-                maps.append(map_id)  # opening it says what is wrong
+                maps.append(map_id)  # opening it reports the error
                 continue
             if isinstance(outline, SetOutline):
                 sets.append(outline)

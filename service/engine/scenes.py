@@ -23,10 +23,11 @@ from visloc.drawing.detail_levels import detail_order, read_landmarks
 from visloc.drawing.point_bytes import read_points
 from visloc.errors import VislocError
 
-# Requests that read at once.
+# Number of requests that read at the same time.
 _THREADS = 2
-# Maps whose orders and photos are kept, whatever their size: a large map takes much longer to order
-# again than a small one. Four bytes per landmark, some hundred per photo.
+# Number of maps whose orders and photos are kept, whatever their size, because a large map takes
+# much longer to order again than a small one. Each takes four bytes per landmark, some hundred per
+# photo.
 _MAX_ORDERS, _MAX_PHOTOS = 4, 4
 
 T = TypeVar("T")
@@ -49,7 +50,7 @@ class Scenes:
         self._photos = _Kept[MappingPhotos](_MAX_PHOTOS)
 
     async def points(self, outline: MapOutline, first: int, count: int) -> bytes:
-        """Return ``count`` landmarks from place ``first`` of the level-of-detail order.
+        """Return ``count`` landmarks of the level-of-detail order, from index ``first`` on.
 
         They are packed as in docs/api.md.
 
@@ -94,7 +95,7 @@ async def _in(threads: Executor, work: Callable[[], T]) -> T:
 
 
 class _Kept(Generic[T]):
-    """The ``most`` recently used values by key, each made once for all who wait for it."""
+    """The ``most`` recently used values by key; concurrent callers share the making of a value."""
 
     def __init__(self, most: int) -> None:
         self._most = most
@@ -102,7 +103,7 @@ class _Kept(Generic[T]):
         self._making: dict[str, asyncio.Task[T]] = {}
 
     async def get(self, key: str, make: Callable[[], Awaitable[T]]) -> T:
-        """Return a value, made if need be. A cancelled caller does not stop it being made."""
+        """Return a value; make it if necessary, even if the caller is cancelled meanwhile."""
         if key in self._values:
             self._values[key] = self._values.pop(key)
             return self._values[key]

@@ -58,7 +58,7 @@ async def answers_in_maps(
 def in_turn(
     instants: AsyncIterator[InstantJob] | Sequence[InstantJob],
 ) -> AsyncIterator[InstantJob]:
-    """Return instants one by one, whether all are there or not."""
+    """Return an iterator over the instants of a list or a stream."""
     return _one_by_one(instants) if isinstance(instants, Sequence) else instants
 
 

@@ -21,10 +21,10 @@ T = TypeVar("T")
 
 
 class Slots:
-    """Room for decoded photos, which take much more memory than encoded ones.
+    """Slots for decoded photos, which take much more memory than encoded ones.
 
     Attributes:
-        waiting: photos that wait for room.
+        waiting: number of photos that wait for a slot.
     """
 
     def __init__(self, count: int) -> None:
@@ -34,11 +34,11 @@ class Slots:
         self.waiting = 0
 
     async def take(self, photos: int) -> int:
-        """Wait for room; return how many slots were taken, all of them for a larger rig."""
+        """Wait for a slot for each photo, at most all slots; return how many were taken."""
         taken = 0
         self.waiting += photos
         try:
-            # One request after the other: two that each hold half of their slots would deadlock.
+            # One request at a time, because two that each hold half of their slots would deadlock.
             async with self._turn:
                 while taken < min(photos, self._count):
                     await self._free.acquire()
@@ -59,7 +59,7 @@ class SetPhotos:
     """The photos of a request to a set. Within ``async with``, they hold slots.
 
     Attributes:
-        queries: the photos, packed where they could be decoded.
+        queries: the photos; those that could be decoded are packed.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class SetPhotos:
         return any(isinstance(query, PackedQuery) for query in self.queries)
 
     async def rank(self, allowed: NDArray[np.bool_] | None) -> list[tuple[TileScore, ...]]:
-        """Decode the photos, unless they are, and rank tiles by each.
+        """Decode the photos if they are not decoded yet, and rank tiles by each.
 
         Args:
             allowed: (T,) the tiles to rank; None to rank none.
@@ -103,7 +103,7 @@ class SetPhotos:
         return [one.scores for one in ranked]
 
     async def aside(self, work: Awaitable[T]) -> T:
-        """Give the slots back during long work; decode the photos again after it."""
+        """Release the slots during long work, and decode the photos again after it."""
         self.queries = self._sent
         self._leave()
         result = await work

@@ -1,7 +1,7 @@
-"""A sequence through a set of maps, in the main process: in legs, each in one tile.
+"""Localizes a sequence in a set of maps, in the main process.
 
-A leg begins with an instant that the tile localizes, and ends when another tile takes over. Gaps
-are filled within a leg, never across two.
+The sequence is cut into legs, each in one tile. A leg begins with an instant that the tile
+localizes, and ends when another tile takes over. Gaps are filled within a leg, never between two.
 """
 
 from __future__ import annotations
@@ -178,20 +178,20 @@ class SetSequence:
             allowed_tiles(self._outline, Priors(maps=priors.maps))
 
     def _priors_in(self, row: int, priors: Priors) -> Priors:
-        """Move priors to a tile's frame; the tile may be none of those that they name."""
+        """Move priors to a tile's frame, also if they do not name the tile."""
         moved = priors_in(self._outline, self._outline.tiles[row], priors)
         return replace(moved, maps=priors.maps)
 
     async def _anywhere(
         self, index: int, instant: InstantJob, photos: SetPhotos
     ) -> _Pending | Localization:
-        """Search all tiles for the first instant of a leg; return the refusal if none has it."""
+        """Search all tiles for the first instant of a leg; return a refusal if none has it."""
         priors = self._start.priors if instant.priors is None else instant.priors
         with inside(f"instants[{index}]"):
             try:
                 allowed = allowed_tiles(self._outline, priors, self._within)
             except NotFound:
-                # As in a map: a device may come from outside.
+                # A map does the same: a device may come from outside.
                 allowed = np.zeros(len(self._outline.tiles), np.bool_)
                 allowed[nearest_tile(self._outline, priors, self._within)] = True
         choice = await self._search.choose(photos, allowed)
@@ -201,11 +201,11 @@ class SetSequence:
     async def _elsewhere(
         self, index: int, instant: InstantJob, photos: SetPhotos, leg: _Leg
     ) -> _Pending | None:
-        """Search an instant that the leg's tile does not localize in the other tiles.
+        """Search the other tiles for an instant that the leg's tile does not localize.
 
         Returns:
-            The instant in a tile that begins a new leg with it. None when it stays in the leg,
-            because no other tile is allowed, or none localizes it clearly enough.
+            The instant in a tile that begins a new leg with it. None if it stays in the leg,
+            because no other tile is allowed, or none localizes it at a plausible place.
         """
         track, priors = self._track, instant.priors or self._start.priors
         seconds = self._seconds_since(track, instant)
@@ -228,7 +228,7 @@ class SetSequence:
         try:
             pending, found = await self._searched(index, instant, photos, choice)
         except (InvalidInput, NotFound):
-            return None  # the leg's tile takes the instant, say because only it knows the rig
+            return None  # it stays with the leg's tile, perhaps because only that knows the rig
         except Unavailable as error:
             if error.code != "set.tile_unavailable":
                 raise

@@ -49,7 +49,7 @@ from visloc.sets.frame import answer_in_set, priors_in_tile, scaled_device
 from visloc.sets.unheard import hard_to_find, left_open
 from visloc.types import Near
 
-# Errors of reaching a map, not of the map itself, have codes that begin so.
+# Codes of errors of reaching a map, not of the map itself, begin with one of these.
 _OF_A_MAP = ("map.", "maps.")
 
 # Searches one tile, given by its row and folder, in the tile's own frame.
@@ -61,10 +61,10 @@ class Choice:
     """The tiles to search, by row.
 
     Attributes:
-        first: the best, and those about as good.
-        rest: to search when none of the first has a clear answer.
+        first: the best one, and those with a similar score.
+        rest: to search if none of the first gives a clear answer.
         allowed: (T,) those that the priors allow.
-        blind: whether the photos ranked no tile.
+        blind: whether no photo could rank tiles.
     """
 
     first: tuple[int, ...]
@@ -88,7 +88,7 @@ class SetSearch:
 
     @property
     def waiting(self) -> int:
-        """Photos that wait for room to be decoded."""
+        """Number of photos that wait for room to be decoded."""
         return self._slots.waiting
 
     def decoding(
@@ -98,10 +98,10 @@ class SetSearch:
         return SetPhotos(self._slots, self._workers, map_set, queries, options)
 
     async def within(self, outline: SetOutline, where: Where) -> NDArray[np.bool_] | None:
-        """Return which tiles (T,) lie near the place that is named; None without a place."""
+        """Return which tiles (T,) lie near the place that a request names; None without a place."""
         if not isinstance(where, Near):
             return None
-        # With ten thousand tiles, it takes a moment.
+        # With ten thousand tiles, this takes too long for the event loop.
         return await asyncio.to_thread(
             tiles_near, outline, where.latitude, where.longitude, where.radius
         )
@@ -155,9 +155,9 @@ class SetSearch:
     ) -> tuple[int, Localization]:
         """Search tiles, and judge their answers.
 
-        A tile that refuses the query, say because it does not know the rig, is ignored as long as
-        others answer. A doubtful answer is refused as ambiguous when it leaves another tile open
-        (``visloc.sets.unheard``).
+        A tile that cannot take the query, for example because it does not know the rig, is ignored
+        as long as others answer. A doubtful answer is refused as ambiguous if it leaves
+        another tile open (``visloc.sets.unheard``).
 
         Returns:
             The row of a tile, and its answer in the set's frame.
@@ -247,10 +247,10 @@ def _says_tile_is_away(error: VislocError) -> bool:
 
 
 async def answers_of(searches: Sequence[Coroutine[Any, Any, Localization]]) -> list[Localization]:
-    """Search maps and sets concurrently; ignore sets of which the priors allow no tile.
+    """Search maps and sets concurrently; ignore sets without a tile that the priors allow.
 
     Raises:
-        NotFound: ``set.no_tile`` when nothing else is searched.
+        NotFound: ``set.no_tile`` if nothing is left to search.
     """
 
     async def answer_of(search: Coroutine[Any, Any, Localization]) -> Localization | NotFound:
@@ -272,7 +272,7 @@ async def answers_of(searches: Sequence[Coroutine[Any, Any, Localization]]) -> l
 def parted(
     maps: Sequence[MapFolder], priors: Priors
 ) -> tuple[tuple[MapFolder, ...], tuple[MapFolder, ...]]:
-    """Separate sets of maps from maps on their own, for which priors must not name tiles."""
+    """Separate sets from other maps. Priors must not name tiles of the latter, which have none."""
     sets = tuple(each for each in maps if each.is_set)
     alone = tuple(each for each in maps if not each.is_set)
     if alone:
@@ -293,7 +293,7 @@ def check_no_tiles(maps: Sequence[MapFolder], priors: Priors) -> None:
 
 
 def in_set(found: Localization, outline: SetOutline, tile: TileRecord) -> Localization:
-    """Move a tile's answer to the set's frame, and name both."""
+    """Move a tile's answer to the set's frame, and name the set and the tile in it."""
     moved, debug = tile.set_from_tile.similarity, found.debug
     if debug is not None:
         debug = replace(debug, points=moved.apply(debug.points))
@@ -316,7 +316,7 @@ def priors_in(outline: SetOutline, tile: TileRecord, priors: Priors) -> Priors:
 
 
 def rig_in(tile: TileRecord, rig: Rig | None) -> Rig | None:
-    """Return a rig in the unit of a tile, which a rig known to the tile already has."""
+    """Return a rig in the unit of a tile; a rig that is only named has that unit already."""
     if rig is None or isinstance(rig, str):
         return rig
     unit = tile.set_from_tile.similarity.inverse().scale

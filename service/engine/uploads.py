@@ -21,7 +21,7 @@ from visloc.errors import Conflict, InvalidInput, MapCorrupt, WeightsError, refu
 
 logger = logging.getLogger(__name__)
 
-# Uploads that are written or verified at once.
+# Number of uploads that are written or verified at the same time.
 MAX_UPLOADS = 4
 # Bytes that are buffered before they are written to disk.
 _WRITE_BYTES = 4 * 2**20
@@ -35,8 +35,8 @@ class Uploads:
 
     Args:
         store: the maps.
-        max_bytes: of a packed map, and of its files.
-        try_out: uses a verified version as a query does; raises if it cannot be used.
+        max_bytes: limit of a packed map, and of its files together.
+        try_out: opens a verified version as a query does; raises if it cannot be used.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class Uploads:
     async def publish(self, map_id: str, version: str, chunks: AsyncIterator[bytes]) -> None:
         """Publish a packed map, verified byte by byte, without making it current.
 
-        Nothing is read of a map that cannot be published. In the end, even if cancelled, temporary
+        If the map cannot be published, its body is not read. Even if this is cancelled, temporary
         files are deleted, and the version is published whole or not at all.
 
         Raises:
@@ -118,7 +118,7 @@ class Uploads:
         self, folder: Path, map_id: str, version: str, loop: asyncio.AbstractEventLoop
     ) -> None:
         """Unpack, verify, try and publish; in a thread."""
-        # Below a folder of their own: a map may be named as the file beside it.
+        # In a folder of their own, because a map may have the name of the file beside it.
         packed, target = folder / "packed", folder / "maps" / map_id / version
 
         def accept(manifest: AnyManifest) -> None:
@@ -138,21 +138,21 @@ class Uploads:
                 )
             self._store.publish(target, map_id, version, make_current=False, accept=accept)
         except MapCorrupt as error:
-            # Damaged before it arrived; and the caller must not learn the server's folders.
+            # The map was damaged before it arrived. The caller must not learn the server's folders.
             field = None if error.field is None else error.field.removeprefix(f"{target}/")
             raise error.about(field, InvalidInput) from error
 
     async def _tried(self, version: MapFolder) -> None:
-        """Raise when a version could never be used here."""
+        """Try a version; raise if it can never be used here."""
         try:
             await self._try_out(version)
-        except (Conflict, WeightsError) as error:  # other features than here: it is not damaged
+        except (Conflict, WeightsError) as error:  # not damaged: it has other features
             logger.info("map %s cannot be used here yet: %s", version.ref, error)
 
     async def _to_end(self, work: Callable[P, T], *given: P.args, **named: P.kwargs) -> T:
         """Run in a thread, and wait for its end even if cancelled.
 
-        Otherwise its files would be deleted while it uses them.
+        Without waiting, files would be deleted while the thread uses them.
         """
         loop = asyncio.get_running_loop()
         task = loop.run_in_executor(self._threads, partial(work, *given, **named))

@@ -15,18 +15,18 @@ from typing import Any
 
 logger = logging.getLogger(__name__)
 
-# Errors of accept() when the system has no room for any connection. Its other errors concern only
-# the connection that was waiting.
+# Errors of accept() that mean that the system has no room for any connection. Its other errors
+# concern only the connection that was waiting.
 _SHORTAGES = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
-# Connections accepted in one turn of the event loop. All that are ready have their share of a turn,
-# and an answer takes a dozen turns: a flood must not make them long.
+# Connections accepted in one turn of the event loop. An answer takes a dozen turns, so a flood must
+# not make them long.
 _BATCH = 2
 # The time that a new connection has to send a request before it may be closed for the next. A flood
 # waits in the backlog, which is served in order.
 _LEAST_IDLE_S = 0.1
 # The pause before accepting again when the system has no room for a connection.
 _RETRY_S = 0.1
-# The time without such an error after which an episode is over.
+# An episode of such errors is over after this time without one.
 _EPISODE_S = 10.0
 
 
@@ -52,21 +52,24 @@ class Connection(asyncio.Protocol, ABC):
 class OpenConnections:
     """The open connections of a port, at most ``limit``.
 
-    A connection is in use from the end of a request's arrival to the end of its answer. Before, its
-    request arrives, from the end of the head on; else it is idle: new, with or without a TLS
-    handshake behind it, or between two requests. At the limit, one is closed for a new one: the
-    longest idle of the kind that has more, and where none is idle, the one whose request has come
-    no further for the longest time, because a body may come very slowly. Where requests that
-    arrive hold most places, they come first. So a flood closes its own connections: one that opens
-    many does not close those of clients that had their answers, nor do many that had answers and
-    ask no more close those that are about to ask.
+    A connection is arriving from the end of a request's head to the end of its body, in use from
+    then to the end of its answer, and idle otherwise: new (with or without a TLS handshake), or
+    between two requests. At the limit, one connection is closed for each new one:
+
+    - normally the longest idle, of the new ones or of those between two requests, whichever are
+      more; if none is idle, the slowest arriving, whose body has made no progress for the longest
+      time;
+    - the slowest arriving first, if more than half are arriving.
+
+    So a flood closes its own connections: many new ones do not close those of clients that had
+    their answers, and many that had answers do not close those that are about to ask.
     """
 
     def __init__(self, limit: int) -> None:
         self.limit = limit
         self._reserve = min(max(1, limit // 10), limit - 1)
         self._open: set[Connection] = set()
-        # Since when; the longest first.
+        # When each became idle or last made progress, the earliest first.
         self._new: dict[Connection, float] = {}
         self._idle: dict[Connection, float] = {}
         self._arriving: dict[Connection, float] = {}
@@ -97,12 +100,12 @@ class OpenConnections:
         self._arriving.pop(connection, None)
 
     def note(self, connection: Connection, *, in_use: bool, arriving: bool = False) -> None:
-        """Record what a connection does. One that goes on doing it keeps its rank.
+        """Record the state of a connection. If the state has not changed, it keeps its rank.
 
         Args:
             connection: one that may have been removed.
-            in_use: whether a request has arrived and is not answered.
-            arriving: whether the body of one that is not answered has not arrived.
+            in_use: whether a request has arrived and has not been answered.
+            arriving: whether the body of a request has not arrived completely.
         """
         if in_use or arriving:
             self._new.pop(connection, None)
@@ -113,12 +116,12 @@ class OpenConnections:
             (self._arriving if arriving else self._idle).setdefault(connection, monotonic())
 
     def renew(self, connection: Connection) -> None:
-        """Record that the request of a connection comes on well."""
+        """Record that the request of a connection has made progress."""
         if self._arriving.pop(connection, None) is not None:
             self._arriving[connection] = monotonic()
 
     def make_room(self) -> float:
-        """At the limit, close the longest idle connection, or one whose request does not come.
+        """At the limit, close a connection for a new one.
 
         Returns:
             Seconds until a connection can be accepted: 0 if one can be now, infinity if all are
@@ -165,7 +168,7 @@ class OpenConnections:
 
 
 def _longest(waiting: Mapping[Connection, float]) -> tuple[Connection, float] | None:
-    """Return the first that has nothing to send, and since when it has waited."""
+    """Return the first connection with nothing to send, and since when it has waited."""
     return next((each for each in waiting.items() if not each[0].is_sending), None)
 
 

@@ -21,7 +21,7 @@ from visloc_api.words.wire import MAP_HEADER, TIMEOUT_HEADER
 
 
 def add_access(app: Starlette, access: Access, observer: Observer, *, page: bool = False) -> None:
-    """Add access control to an app, and CORS around it if web pages of other origins may call.
+    """Add access control to an app, and CORS around it if other origins may call.
 
     Call this before the envelope is added, which must be outermost: it gives requests their ids.
 
@@ -90,7 +90,7 @@ class AccessControl:
 
 
 def _note_route(scope: Scope) -> None:
-    """Note for the log which route a refused request was for: the app does not get to see it."""
+    """Record the route of a refused request for the log, because the app never sees it."""
     for route in scope["app"].routes:
         if route.matches(scope)[0] is Match.FULL:
             scope["route"] = route

@@ -1,4 +1,4 @@
-"""What the routes work with; kept in the state of the app."""
+"""The parts of the service that the routes use; kept in the state of the app."""
 
 from __future__ import annotations
 

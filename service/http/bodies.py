@@ -26,7 +26,7 @@ from visloc_api.words.sequences import LocalizeSequenceRequest
 # The parts of the form of one photo that are files, and the file names in curl's examples.
 _FILES_PER_IMAGE = 2  # a photo and its mask
 _FILES = {"image": "photo.jpg", "features": "photo.json", "mask": "mask.png"}
-# JSON from which on it is parsed on its own, if it has not too many values before.
+# Bytes of JSON from which on it is parsed in the thread for long texts, whatever it holds.
 _LARGE_BYTES = 2**20
 _FORM, _JSON = "multipart/form-data", "application/json"
 # Values in a sequence: each takes about a microsecond and 100 bytes to parse. A photo needs 16 for
@@ -34,7 +34,7 @@ _FORM, _JSON = "multipart/form-data", "application/json"
 # with its covariance, and a pose prior.
 _VALUES_PER_IMAGE, _LEAST_PER_INSTANT = 16, 150
 JobT = TypeVar("JobT")
-# Makes a job from the JSON of a batch and the files that it names.
+# Function that makes a job from the JSON of a batch and the files that it names.
 ToJob = Callable[[str | bytes, Mapping[str, bytes]], JobT]
 
 
@@ -70,7 +70,7 @@ async def read_localize_job(request: Request) -> RigJob:
 
     if checked_media_type(request, (_FORM, _JSON)) == _FORM:
         async with backend.arrivals.body(request, backend.settings.max_request_bytes) as body:
-            # Parsing takes milliseconds: not on the event loop.
+            # Parsing takes milliseconds, too long for the event loop.
             return await asyncio.to_thread(from_form, body)
     async with backend.arrivals.body(request, backend.settings.max_json_bytes) as body:
         return await parsed(body, partial(from_json, body))

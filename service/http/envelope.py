@@ -21,7 +21,7 @@ from visloc.errors import VislocError, refuse
 
 logger = logging.getLogger(__name__)
 
-# Answered even when all connections are in use.
+# Routes that are answered even when all connections are in use.
 _PROBED_PATHS = ("/healthz", "/readyz", "/metrics")
 _METHODS = ("GET", "HEAD", "POST", "PUT", "DELETE", "OPTIONS", "PATCH")
 
@@ -58,11 +58,11 @@ class RequestEnvelope:
                 record.route = route_of(scope)
 
     def _complete(self, start: Message, record: RequestRecord) -> None:
-        """Note the status of an answer that starts, and add our headers to it."""
+        """Record the status of an answer that starts, and add our headers to it."""
         record.status = str(start["status"])
         headers = MutableHeaders(scope=start)
         headers["X-Request-Id"] = record.request_id
-        if self._engine.draining:  # else the next request would be cut off
+        if self._engine.draining:  # otherwise the next request would be cut off
             headers["Connection"] = "close"
         if record.trace is not None:
             headers["traceresponse"] = traceparent_of(record.trace)
@@ -79,7 +79,7 @@ class RequestEnvelope:
         headers = Headers(scope=scope)
         try:
             if "content-length" in headers and "transfer-encoding" in headers:
-                # RFC 9112, 6.3: a proxy may have understood it otherwise.
+                # RFC 9112, 6.3: a proxy may have read the request differently.
                 await refuse(_ambiguous(), HTTPStatus.BAD_REQUEST)
             elif self._connections.is_busy and scope["path"] not in _PROBED_PATHS:
                 await refuse(_busy())
@@ -90,7 +90,7 @@ class RequestEnvelope:
                 raise
             await refuse(stopping_error())
         except ClientDisconnect:
-            if record.status:  # else it is in the log as cancelled
+            if record.status:  # otherwise the log has it as cancelled
                 logger.info("the client of request %s left within the answer", record.request_id)
         except Exception:  # the last line of defence: every caller gets an answer
             logger.exception("request %s failed unexpectedly", record.request_id)

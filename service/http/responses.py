@@ -1,4 +1,4 @@
-"""HTTP answers: JSON, problems and streamed lines; and clients that disconnect."""
+"""HTTP answers: JSON, problems and streamed lines. Handles clients that disconnect."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def problem_response(error: VislocError, id_: str, status: HTTPStatus | None = N
 
 
 async def while_connected(receive: Receive, work: Coroutine[Any, Any, T]) -> T:
-    """Do the work; cancel it when the client hangs up.
+    """Do the work; cancel it if the client hangs up.
 
     Raises:
         ClientDisconnect: when the client hung up.
@@ -82,11 +82,12 @@ async def while_connected(receive: Receive, work: Coroutine[Any, Any, T]) -> T:
 class Lines(Response):
     """One line of JSON per answer, sent as soon as the answer is there.
 
-    The next answer is computed only when the client has taken the previous ones. An error after the
-    first line becomes a last line ``{"problem": {...}}``. The work ends when the client hangs up.
+    The next answer is computed only after the client has taken the previous ones. After the first
+    line, an error becomes the last line, ``{"problem": {...}}``. The work ends when the client
+    hangs up.
 
     Args:
-        first: computed before, so that an error up to here is an ordinary problem.
+        first: the first answer, computed beforehand, so that an error until then is a problem.
         others: the answers after it; closed at the end.
         message: converts an answer to the words of the API.
         patience_s: the longest that the client may take for a line.
@@ -102,7 +103,7 @@ class Lines(Response):
     ) -> None:
         super().__init__(media_type=NDJSON)
         del self.headers["content-length"]
-        self.headers["X-Accel-Buffering"] = "no"  # or nginx would keep the lines to itself
+        self.headers["X-Accel-Buffering"] = "no"  # otherwise nginx would buffer the lines
         self._answers = _with_first(first, others)
         self._message = message
         self._id = id_

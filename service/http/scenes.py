@@ -105,7 +105,7 @@ async def get_images(
 async def _of_version(
     engine: Engine, ref: str, answer: Callable[[MapOutline], Awaitable[Response]]
 ) -> Response:
-    """Answer for the version that ``ref`` stands for."""
+    """Answer with the version that ``ref`` names."""
     outline = _of_map((await engine.map(ref)).outline)
     try:
         return await answer(outline)
@@ -113,7 +113,7 @@ async def _of_version(
         now = _of_map((await engine.map(ref)).outline)
         if now.ref == outline.ref:
             raise
-        return await answer(now)  # a new version is current, and the old one was deleted
+        return await answer(now)  # a new version became current, and the old one was deleted
 
 
 def _of_map(outline: MapOutline | SetOutline) -> MapOutline:
@@ -130,6 +130,6 @@ def _caching(outline: MapOutline, ref: str, first: int, count: int) -> dict[str,
         # The content hash does not cover the version, which answers name.
         "ETag": f'"{manifest.version}-{manifest.content_hash[:32]}-{first}-{count}"',
         "Cache-Control": FOR_EVER_PRIVATE if "@" in ref else ASK_ALWAYS_PRIVATE,
-        # A cached answer is not for callers with another key or none.
+        # A cache must not give the answer to callers with another key or none.
         "Vary": "Authorization, X-API-Key",
     }

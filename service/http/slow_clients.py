@@ -1,4 +1,4 @@
-"""Slow HTTP clients: how long a request may take to arrive, and how much may arrive at once."""
+"""Limits how long an HTTP request may take to arrive, and how many bytes may arrive at once."""
 
 from __future__ import annotations
 
@@ -17,15 +17,16 @@ from service.http.acceptor import Connection, OpenConnections
 from service.settings import SLOWEST_BYTES_PER_S
 from visloc.errors import VislocError, refuse
 
-# Of a request: several times what the longest keys and ids need.
+# Largest head of a request: several times what the longest keys and ids need.
 _MAX_HEAD_BYTES = 16 * 1024
-# Chunks in which any body may come. More must have so many bytes each, on average: h11 takes five
-# microseconds for a chunk, on the event loop. Packets cost their sender as much.
+# Number of chunks that any body may have. Further chunks must have so many bytes each on average,
+# because h11 takes five microseconds for a chunk, on the event loop. Small packets need no such
+# limit: they cost their sender as much.
 _FREE_CHUNKS, _LEAST_CHUNK_BYTES = 2000, 64
 
 
 class LargeChunks(h11.Connection):
-    """HTTP/1.1 of a server that does not take bodies in very many chunks of a few bytes."""
+    """HTTP/1.1 of a server that refuses bodies in very many chunks of a few bytes."""
 
     _chunks = _bytes = 0
 
@@ -49,18 +50,21 @@ class LargeChunks(h11.Connection):
 class TimelyProtocol(H11Protocol, Connection):
     """uvicorn's HTTP/1.1, which closes the connections of slow clients.
 
-    A connection is closed when the head of a request takes longer than ``grace_s`` to arrive. It is
-    closed when the body of a refused request takes as long to end. It is closed when the client
-    does not take an answer within ``grace_s`` and a second for every 100 kB that wait. Bodies
-    that are read are guarded by ``Arrivals``, idle connections by uvicorn. What is no HTTP gets 400
-    and the connection is closed, without a line in the log: anybody could fill it.
+    A connection is closed in these cases:
+
+    - the head of a request takes longer than ``grace_s`` to arrive;
+    - the body of a refused request takes longer than that to end;
+    - the client does not take an answer within ``grace_s`` plus a second for every waiting 100 kB;
+    - the input is not HTTP. The answer is 400, without a line in the log, which anybody could fill.
+
+    ``Arrivals`` limits the time of bodies that are read, uvicorn that of idle connections.
     """
 
     grace_s: float
     open_connections: OpenConnections
     _arriving: asyncio.TimerHandle | None = None
     _leaving: asyncio.TimerHandle | None = None
-    _received = 0  # bytes since the connection was renewed
+    _received = 0  # bytes since its last recorded progress
 
     def __init__(self, config: uvicorn.Config, *args: Any, **kwargs: Any) -> None:
         super().__init__(config, *args, **kwargs)
@@ -69,7 +73,7 @@ class TimelyProtocol(H11Protocol, Connection):
     def send_400_response(self, msg: str) -> None:
         if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):
             super().send_400_response(msg)
-        else:  # there was an answer before the request went wrong
+        else:  # the answer had begun before the error
             self.transport.abort()
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
@@ -121,7 +125,7 @@ class TimelyProtocol(H11Protocol, Connection):
             self._leaving.cancel()
 
     def _watch(self, *, first: bool = False) -> None:
-        """Start the clock when it is the client's turn. More data does not reset the clock."""
+        """Start the clock when the server waits for the client. More data does not reset it."""
         state = self.conn.their_state
         arriving = state is h11.SEND_BODY and self.conn.our_state is h11.SEND_RESPONSE
         in_use = self.cycle is not None and not self.cycle.response_complete and not arriving
@@ -144,11 +148,11 @@ def http_protocol(grace_s: float, connections: OpenConnections) -> type[TimelyPr
 
 
 class Arrivals:
-    """Bodies of HTTP requests while they arrive.
+    """Reads the bodies of HTTP requests within limits of time and memory.
 
     Args:
         grace_s: the longest that any body may take, plus a second for every 100 kB received.
-        max_bytes: of all bodies that are arriving or being parsed.
+        max_bytes: limit of all bodies together that are arriving or being parsed.
     """
 
     def __init__(self, grace_s: float, max_bytes: int) -> None:
@@ -163,7 +167,7 @@ class Arrivals:
 
     @asynccontextmanager
     async def body(self, request: Request, limit: int) -> AsyncIterator[bytes]:
-        """Read a body, which counts as held until the block ends.
+        """Read a body. Its bytes count as held until the block ends.
 
         Raises:
             TooLarge: ``request.too_large``, before the rest of the body is read.
@@ -192,7 +196,7 @@ class Arrivals:
             self._held -= len(body)
 
     async def chunks(self, request: Request) -> AsyncGenerator[bytes]:
-        """Give the chunks of a body as they come; they do not count as held.
+        """Yield the chunks of a body as they arrive. They do not count as held.
 
         Raises:
             TimedOut: ``request.too_slow``.

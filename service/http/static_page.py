@@ -17,7 +17,7 @@ from visloc_web import page_folder
 
 logger = logging.getLogger(__name__)
 
-# Path by file. Swagger UI and ReDoc are to be found where other FastAPI services have them.
+# Path by file. Swagger UI and ReDoc have the same paths as in other FastAPI services.
 PAGES = {"/": "index.html", "/docs": "docs.html", "/redoc": "redoc.html"}
 # Written out because `mimetypes` depends on the machine.
 _TYPES = {
@@ -94,7 +94,7 @@ def add_page_routes(app: FastAPI) -> None:
 
 
 def _read(folder: Path) -> tuple[Mapping[str, _File], Mapping[str, _File]]:
-    """Read the pages, and the assets by name: a requested name never becomes a path."""
+    """Read the pages, and the assets by name, so that a requested name never becomes a path."""
     assets = {path.name: _read_file(path) for path in sorted((folder / "assets").glob("*"))}
     return {path: _read_file(folder / name) for path, name in PAGES.items()}, assets
 

@@ -23,7 +23,7 @@ MAX_SEARCHED = 5
 # Tiles with at least this share of the best score are searched together with the best: look-alike
 # floors score 0.55 to 1 of each other, places that are not alike below 0.3.
 _CLOSE_SCORE = 0.5
-# With so many inliers, and so probable a pose, no other tile is searched.
+# An answer with at least so many inliers and so high a probability ends the search.
 CLEAR_INLIERS, CLEAR_PROBABILITY = 100, 0.9
 _NAMED = 5
 
@@ -42,7 +42,7 @@ class TileScore:
 def tiles_near(
     outline: SetOutline, latitude: float, longitude: float, radius: float
 ) -> NDArray[np.bool_]:
-    """Tell which tiles overlap a circle on Earth (degrees, and a radius in metres).
+    """Tell which tiles overlap a circle on Earth (degrees; radius in metres).
 
     Returns:
         (T,) all False for a set without a place on Earth.
@@ -148,16 +148,16 @@ def plan(scores: Sequence[TileScore]) -> tuple[tuple[int, ...], tuple[int, ...]]
 
 
 def is_clear(answer: InstantAnswer) -> bool:
-    """Tell whether a pose is so sure that no other tile needs to be searched."""
+    """Tell whether a pose is so certain that no other tile needs to be searched."""
     if measured_pose(answer) is None or answer.num_inliers < CLEAR_INLIERS:
         return False
     return not is_doubtful(answer)
 
 
 def is_doubtful(answer: InstantAnswer) -> bool:
-    """Tell whether a pose is stated to be less than probable.
+    """Tell whether the probability of a pose is low.
 
-    A pose without a probability, such as one from motion, is not judged.
+    A pose without a probability, such as one from motion, is not doubtful.
     """
     pose = measured_pose(answer)
     if pose is None or pose.probability is None:

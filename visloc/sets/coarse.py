@@ -1,10 +1,10 @@
 """A coarse index over all photos of all tiles, which ranks the tiles for a query.
 
 A photo's stored descriptors are pooled to one vector (``localvlad``, with one vocabulary and one
-projection for all tiles), and turned, so that no dimension tells more than another. The photos of
-each tile are a few lists of an inverted file. A query is compared with the codes of the lists that
-are most like it, and then with all codes of the tiles of the best photos. Nothing here loops over
-all tiles or photos in Python (docs/decisions/0034-the-index-is-faiss.md).
+projection for all tiles). The vector is rotated, so that all dimensions carry about as much
+information. The photos of each tile are a few lists of an inverted file. A query is compared with
+the codes of the lists most similar to it, and then with all codes of the tiles of the best photos.
+Nothing here loops over all tiles or photos in Python (docs/decisions/0034-the-index-is-faiss.md).
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ from visloc.types import LocalFeatures
 
 CoarseModel = Mapping[str, NDArray[np.float32]]
 
-# Lists of a tile.
+# Number of lists of a tile.
 TILE_LISTS = 4
-# Lists that are searched: so many, or this share of those of a larger set.
+# Number of lists that are searched: the larger of this number and this share of all lists.
 _MIN_LISTS, _SHARE_OF_LISTS = 400, 0.04
-# Photos whose tiles are ranked, and how many tiles at most.
+# Maximum number of photos whose tiles are ranked, and of tiles that are ranked.
 _NUM_PROPOSED, MAX_RANKED = 1000, 50
-# A tile scores the mean of its best photos, as one alone may be similar by chance.
+# The score of a tile is the mean of its best photos: a single one may be similar by chance.
 _NUM_BEST = 3
 NO_PIXELS = np.empty((0, 0, 3), np.uint8)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DescribedTile:
-    """One tile in the index: (TILE_LISTS, W) float32 centres of its lists, and these."""
+    """One tile in the index: its lists and their centres, (TILE_LISTS, W) float32."""
 
     centers: NDArray[np.float32]
     lists: MadeLists
@@ -76,13 +76,13 @@ def described(rows: NDArray[np.float32], model: CoarseModel) -> DescribedTile:
     """
     turned = rows @ model["rotation"]
     centers = make_centers(turned, TILE_LISTS)
-    # A tile with fewer photos repeats centres, whose lists stay empty.
+    # With fewer photos than lists, centres are repeated, and the lists of the copies stay empty.
     centers = centers[np.arange(TILE_LISTS) % len(centers)]
     return DescribedTile(centers, make_lists(turned, centers))
 
 
 def coarse_index(described: Iterator[DescribedTile], model: CoarseModel, path: Path) -> CoarseIndex:
-    """Join described tiles to an index, whose lists are written into a new file."""
+    """Make an index of described tiles, and write its lists into a new file."""
     centers, sizes, counts = [], [], [0]
 
     def lists() -> Iterator[MadeLists]:
@@ -156,7 +156,7 @@ def ranked(
 def _proposed(
     coarse: CoarseIndex, query: NDArray[np.float32], tiles: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """The tiles whose photos' codes are most like the query's, in the order of the set."""
+    """Return the tiles of the photos most similar to a rotated query, in the order of the set."""
     inverted = coarse.inverted
     count = max(_MIN_LISTS, math.ceil(_SHARE_OF_LISTS * len(inverted.sizes)))
     lists = inverted.nearest_lists(query, count, _lists_of(coarse, tiles))
@@ -172,7 +172,7 @@ def _proposed(
 def score_without(
     coarse: CoarseIndex, query: NDArray[np.float32], tile: int, left_out: NDArray[np.int64]
 ) -> float:
-    """Score a tile as ``ranked`` does, as if it did not have some of its photos.
+    """Score a tile as ``ranked`` does, but without some of its photos.
 
     Args:
         coarse: the index.
@@ -189,7 +189,7 @@ def _score(
     query: NDArray[np.float32],
     left_out: NDArray[np.int64] | None = None,
 ) -> float:
-    """The mean cosine of a query, which was turned, with the best photos of a tile."""
+    """Return the mean cosine of a rotated query with the best photos of a tile."""
     inverted, allowed = coarse.inverted, None
     if left_out is not None:
         allowed = np.ones(inverted.num_rows, np.bool_)
@@ -216,6 +216,6 @@ def words_of(opened: Map, photo: int) -> NDArray[np.float32]:
 
 
 def without_positions(words: NDArray[np.float32]) -> LocalFeatures:
-    """Return descriptors (n, d) as local features, as the pooling of words wants them."""
+    """Wrap descriptors (n, d) as local features, which the pooling expects."""
     nowhere = np.zeros(len(words), np.float32)
     return LocalFeatures(np.zeros((len(words), 2), np.float32), words, nowhere, nowhere)

@@ -127,7 +127,7 @@ def _moved_coarse(coarse: CoarsePose, set_from_tile: Similarity) -> CoarsePose:
 def _position_std(
     pose: Pose, covariance: NDArray[np.float64], a_from_b: Similarity
 ) -> NDArray[np.float64]:
-    """Standard deviations of a position along the axes of frame a, from the pose in frame b."""
-    # Computed in b, as digits are lost far from the origin of a.
+    """Return standard deviations of a position along frame a's axes, from a pose in frame b."""
+    # Computed in frame b, because far from the origin of frame a digits are lost.
     turned = a_from_b.rotation @ position_covariance(pose, covariance) @ a_from_b.rotation.T
     return np.asarray(a_from_b.scale * np.sqrt(np.maximum(np.diag(turned), 0.0)))

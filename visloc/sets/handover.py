@@ -29,7 +29,7 @@ class Track:
         pose: rig_from_set.
         covariance: (6, 6), of the pose.
         metre: length of a metre in the set's unit; None when unknown.
-        odometry: the newest odometry; None where the chain is broken.
+        odometry: the newest odometry; None after an instant without any.
         motion: rig_from_rig since the measurement, metres.
         drift: (6, 6) covariance of the motion.
     """
@@ -55,7 +55,7 @@ class Track:
         return Track(timestamp, pose, covariance, metre, odometry, Pose.identity(), nothing)
 
     def moved(self, odometry: Odometry | None) -> Track:
-        """Add the motion to the next timestamp; None breaks the chain."""
+        """Add the motion up to the next instant; after None, the motion is unknown."""
         if odometry is None or self.odometry is None:
             return replace(self, odometry=None)
         step = odometry.rig_from_odometry @ self.odometry.rig_from_odometry.inverse()
@@ -77,7 +77,7 @@ class Track:
     def allows(
         self, pose: Pose, covariance: NDArray[np.float64], seconds: float, reach: float
     ) -> bool:
-        """Tell whether the device may have the pose that another tile measured.
+        """Tell whether the device can have moved to the pose that another tile measured.
 
         Args:
             pose: rig_from_set.

@@ -1,7 +1,7 @@
-"""Tiles that a doubtful answer leaves open: the photo may show them, but they had no say.
+"""Refuses doubtful answers when the photo may show a tile that is too poor to answer.
 
-That a tile finds no pose speaks against it only if it finds its own photos. A poor tile does not,
-and its photos would go to another tile that looks like it.
+If a tile finds no pose, that is evidence against it only if the tile finds its own photos. A tile
+with few photos or landmarks does not: its photos would be placed in a tile that looks like it.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from visloc.localization.judge import PlaceAnswer, candidate, measured_pose, mos
 from visloc.sets.choosing import MAX_SEARCHED, is_doubtful
 from visloc.types import Reason, Refusal
 
-# Below, an answer is more likely wrong than right.
+# Below this probability, an answer is more likely wrong than right.
 _MORE_LIKELY_RIGHT = 0.5
 
 
 def hard_to_find(
     outline: SetOutline, doubtful: Collection[str], left: NDArray[np.bool_]
 ) -> tuple[int, ...]:
-    """Return tiles that were not searched because the set takes their photos for other tiles'.
+    """Return tiles that must be searched because a doubtful answer may be theirs.
 
     Args:
         outline: the set.
@@ -31,8 +31,8 @@ def hard_to_find(
         left: (T,) tiles that may be searched, and were not.
 
     Returns:
-        Rows of tiles whose photos are mistaken for those of a tile with a doubtful answer, five at
-        most.
+        Rows of at most five tiles whose photos are mistaken for those of a tile with a doubtful
+        answer.
     """
     if not doubtful:
         return ()
@@ -52,12 +52,16 @@ def left_open(
 ) -> Refusal | None:
     """Refuse a doubtful answer that leaves another tile open.
 
-    A tile that does not agree stays open when its own photos are mistaken for those of the tile
-    that answers, even if it has a pose that explains much less: it is poor. But where the tile that
-    answers misses photos of its own, doubtful answers to these are usual, and no sign of another
-    place: there a tile stays open only if the answer is more likely wrong than right. Then, so does
-    one that looks about as much like the photo. Tiles of the same place, whose photos lie among
-    each other, are no contradiction.
+    Another tile that gave no pose at the same place is open in these cases:
+
+    - Its own photos are mistaken for those of the answering tile, and the answering tile finds its
+      own photos. It is open even if it has a pose that explains much less, because it is poor. A
+      tile that misses photos of its own gives doubtful answers to them as well, so there a doubtful
+      answer is no sign of another place.
+    - Its own photos are mistaken for those of the answering tile, or it looks about as much like
+      the query, and the answer is more likely wrong than right.
+
+    Tiles whose photos lie among each other show the same place, and are never open.
 
     Args:
         outline: the set.
@@ -67,8 +71,8 @@ def left_open(
         close: rows of the tiles with at least half of the best coarse score.
 
     Returns:
-        A refusal, ``ambiguous``, with the poses that there are as its candidates; None for an
-        answer that stands.
+        A refusal, ``ambiguous``, with the poses of both tiles as candidates, as far as they have
+        one; None for an answer that stands.
     """
     place, tiles = places[row], outline.tiles
     pose = measured_pose(place.answer)
@@ -101,7 +105,7 @@ def left_open(
 
 
 def apart(boxes: NDArray[np.float64], row: int) -> NDArray[np.bool_]:
-    """Tell which tiles (T,) have no photos among those of one.
+    """Tell which tiles (T,) have photos in a box that does not overlap that of one tile.
 
     Args:
         boxes: (T, 2, 3) least and largest coordinates of each tile's photos.

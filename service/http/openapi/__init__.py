@@ -10,9 +10,9 @@ from typing import Any
 def example(name: str) -> Any:
     """Return ``examples/NAME.json``.
 
-    Requests can be sent as they are: their photo is a grey one of 64 x 48 pixels, their features
-    are two keypoints of XFeat. Answers are those of a server, with fewer digits and photos. What
-    ends in ``_body`` is the schema of a body.
+    Requests can be sent as they are: their photo is grey, with 64 x 48 pixels, and their features
+    are two keypoints of XFeat. Answers are those of a server, with fewer digits and photos. Names
+    that end in ``_body`` are schemas of bodies.
     """
     text = files(__name__).joinpath("examples", f"{name}.json").read_text(encoding="utf-8")
     return json.loads(text)

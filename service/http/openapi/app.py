@@ -67,12 +67,12 @@ def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
 class App(FastAPI):
     """FastAPI with the schemas of bodies that it does not parse itself.
 
-    /openapi.json, which needs no key, is written once: FastAPI writes it for each request, which
-    keeps the event loop for milliseconds.
+    /openapi.json needs no key and is written once. FastAPI writes it for each request, which blocks
+    the event loop for milliseconds.
     """
 
     def setup(self) -> None:
-        """Add the route of the schema, which is complete when it is first asked for."""
+        """Add the route of the schema, which is written when it is first requested."""
 
         async def answer(_: Request) -> Response:
             return Response(self._written, media_type="application/json")
@@ -103,7 +103,7 @@ class App(FastAPI):
             schema["components"]["schemas"]["Problem"]["example"] = example("problem")
             key = {"type": "http", "scheme": "bearer", "description": "an API key"}
             schema["components"]["securitySchemes"] = {"key": key}
-            schema["security"] = [{}, {"key": []}]  # a server may want none
+            schema["security"] = [{}, {"key": []}]  # a server may need no key
             # Added here, because FastAPI drops nulls from the examples of routes.
             for (path, method, status), shown in _ANSWERS.items():
                 response = schema["paths"][path][method]["responses"][status]
