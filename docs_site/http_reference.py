@@ -29,9 +29,9 @@ def http_reference() -> str:
 
 def _openapi() -> Schema:
     # The routes take from the backend only what decides which of them there are.
-    backend = SimpleNamespace(
-        settings=read_settings([], {}).model_copy(update={"page": False}), access=SimpleNamespace(origins=()), observer=None
-    )
+    settings = read_settings([], {}).model_copy(update={"page": False})
+    access = SimpleNamespace(origins=())
+    backend = SimpleNamespace(settings=settings, access=access, observer=None)
     return create_app(cast(Backend, backend)).openapi()
 
 
