@@ -385,7 +385,7 @@ def test_without_matplotlib_nothing_is_asked(
     arguments = ("--map", "room", "--axis", "top-k", "--output", tmp_path, "--server", http_url)
 
     assert compare(make_dataset({"a": b"photo"}), *arguments) == 1
-    assert "pip install 'visloc[compare]'" in capsys.readouterr().err
+    assert "pip install matplotlib" in capsys.readouterr().err
     assert service.seen == []
 
 
