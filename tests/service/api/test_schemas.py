@@ -118,7 +118,8 @@ def test_options_may_be_text() -> None:
             "request.unknown_field",
             "options.topk",
             "one of preset, top_k, photos, max_error_px, min_inliers, min_inlier_ratio, "
-            "min_probability, read_as, extraction, fusion, fusion_weights, matcher, solver, seed",
+            "min_probability, read_as, extraction, fusion, fusion_weights, fusion_parameter, "
+            "matcher, solver, seed, fallback",
         ),
         (
             request(camera=CAMERA | {"fov": 60}),
