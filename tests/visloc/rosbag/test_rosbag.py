@@ -258,6 +258,9 @@ def test_what_is_written_is_read_again(tmp_path: Path, ros1: bool) -> None:
 
     write_poses(path, "/pose", "map", [PoseStamped(12_000_000_034, pose, covariance)], ros1=ros1)
 
+    assert [each.name for each in tmp_path.iterdir()] == [path.name]
+    if not ros1:  # nothing hidden, which a copy of poses/* would leave behind
+        assert {each.name for each in path.iterdir()} == {"metadata.yaml", "poses.db3"}
     with open_bag(path) as bag:
         assert bag.photos == ()
         ((topic, message),) = bag.messages(["/pose"])
