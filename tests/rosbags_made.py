@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ SECOND = 1_000_000_000
 WORLD, BASE = "map", "base_link"
 
 
-class _Made:
+class Made:
     """Messages of one generation of ROS."""
 
     def __init__(self, ros1: bool) -> None:
@@ -54,6 +55,40 @@ class _Made:
             header=self.header(time_ns, parent),
             child_frame_id=child,
             transform=moved,
+        )
+
+    def moved(self, time_ns: int, parent: str, child: str, pose: Pose) -> Any:
+        """Return a message of tf with one transform."""
+        transforms = [self.transform(time_ns, parent, child, pose)]
+        return self("tf2_msgs/msg/TFMessage", transforms=transforms)
+
+    def odometry(self, time_ns: int, parent: str, child: str, pose: Pose) -> Any:
+        """Return odometry that stands still there."""
+        w, x, y, z = map(float, pose.rotation_wxyz)
+        px, py, pz = map(float, pose.translation)
+        at = self(
+            "geometry_msgs/msg/Pose",
+            position=self("geometry_msgs/msg/Point", x=px, y=py, z=pz),
+            orientation=self("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
+        )
+        still = self("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+        twist = self("geometry_msgs/msg/Twist", linear=still, angular=still)
+        none = np.zeros(36)
+        return self(
+            "nav_msgs/msg/Odometry",
+            header=self.header(time_ns, parent),
+            child_frame_id=child,
+            pose=self("geometry_msgs/msg/PoseWithCovariance", pose=at, covariance=none),
+            twist=self("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=none),
+        )
+
+    def file(self, time_ns: int, frame: str, encoded: bytes) -> Any:
+        """Return a compressed picture."""
+        return self(
+            "sensor_msgs/msg/CompressedImage",
+            header=self.header(time_ns, frame),
+            format="jpeg",
+            data=np.frombuffer(encoded, np.uint8),
         )
 
     def image(self, time_ns: int, frame: str, pixels: Any, encoding: str) -> Any:
@@ -92,13 +127,27 @@ class _Made:
         )
 
 
+def write_messages(path: Path, made: Made, messages: Iterable[tuple[str, str, int, Any]]) -> None:
+    """Write messages: topic, kind, time of arrival (ns), message."""
+    from rosbags import rosbag1, rosbag2
+
+    opened: Any = rosbag1.Writer(path) if made.ros1 else rosbag2.Writer(path, version=8)
+    encode = made.store.serialize_ros1 if made.ros1 else made.store.serialize_cdr
+    connections: dict[str, Any] = {}
+    with opened as writer:
+        for topic, kind, time_ns, message in messages:
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=made.store)
+            writer.write(connections[topic], time_ns, encode(message, kind))
+
+
 def write_bag(
     path: Path, dataset: Dataset, *, ros1: bool, compressed: bool = False, depth: bool = True
 ) -> None:
     """Write the photos of one camera of a dataset, a second apart, with tf and depth."""
     from rosbags import rosbag1, rosbag2
 
-    made = _Made(ros1)
+    made = Made(ros1)
     sensor = dataset.images[0].sensor_id
     images = [record for record in dataset.images if record.sensor_id == sensor]
     camera = dataset.sensors[sensor].camera
@@ -117,21 +166,17 @@ def write_bag(
         info = topic("/camera/camera_info", "sensor_msgs/msg/CameraInfo")
         aligned = topic("/depth/image", "sensor_msgs/msg/Image") if depth else None
         tf, static = (topic(name, "tf2_msgs/msg/TFMessage") for name in ("/tf", "/tf_static"))
-        fixed = made.transform(0, BASE, optical, BASE_FROM_OPTICAL)
-        static(SECOND, made("tf2_msgs/msg/TFMessage", transforms=[fixed]))
+        static(SECOND, made.moved(0, BASE, optical, BASE_FROM_OPTICAL))
         for number, record in enumerate(images):
             time_ns = (number + 1) * SECOND
             cam_from_world = dataset.pose(record)
             assert cam_from_world is not None
             base_in_map = cam_from_world.inverse() @ BASE_FROM_OPTICAL.inverse()
-            moved = made.transform(time_ns, WORLD, BASE, base_in_map)
-            tf(time_ns, made("tf2_msgs/msg/TFMessage", transforms=[moved]))
+            tf(time_ns, made.moved(time_ns, WORLD, BASE, base_in_map))
             info(time_ns, made.info(time_ns, optical, camera))
             file = dataset.path_of(record)
             if compressed:
-                header = made.header(time_ns, optical)
-                data = np.frombuffer(file.read_bytes(), np.uint8)
-                photo(time_ns, made(kind, header=header, format="jpeg", data=data))
+                photo(time_ns, made.file(time_ns, optical, file.read_bytes()))
             else:
                 pixels = cv2.imread(str(file))
                 photo(time_ns, made.image(time_ns, optical, pixels, "bgr8"))

@@ -372,9 +372,9 @@ class NotLocalized:
     coarse: CoarsePose | None = None
 
     @property
-    def status(self) -> Literal["not_localized"]:
+    def status(self) -> Literal["coarse", "not_localized"]:
         """The word of the API."""
-        return "not_localized"
+        return "not_localized" if self.coarse is None else "coarse"
 
 
 Answer = Localized | NotLocalized

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -10,12 +11,16 @@ import numpy as np
 import typer
 from rich.console import Console
 
+from clients.cli.display import print_line
 from clients.cli.options import Connection, MapRef, QueryOptions, spread
 from clients.cli.progress import run_with_progress
 from clients.client import AsyncClient
-from visloc.errors import refuse
+from clients.evaluation.results import check_can_be_written
+from clients.evaluation.run import ask_patiently, raise_unless_of_one
+from visloc.errors import VislocError, refuse
 from visloc.geometry import Pose, propagated
 from visloc.rosbag import Bag, Picture, PoseStamped, open_bag, write_poses
+from visloc_api.words.options import LocalizeOptions
 from visloc_api.words.poses import PoseEstimate
 
 _err = Console(stderr=True)
@@ -52,29 +57,49 @@ def bag(
     """Localize the photos of a ROS bag and write their poses as a new bag.
 
     Writes PoseWithCovarianceStamped messages to /visloc/pose, with the stamps of the photos. A
-    photo that is not localized has no message. Needs no ROS.
+    photo that is not localized has no message, nor one for whose time tf does not tell how the
+    frame lies to the camera. Needs no ROS.
 
     Exits with 0 when at least one photo was localized, 3 when none was, 1 on an error.
     """
     if output.exists():
         raise refuse("bag.exists", field=str(output))
+    check_can_be_written([output])
     poses: list[PoseStamped] = []
-    asked = 0
+    failed: list[VislocError] = []
     with open_bag(path) as opened:
         topics = _chosen(opened, topic)
+        if frame is None and len(topics) > 1:
+            raise refuse("bag.cameras", field="--frame", got=", ".join(topics))
+        with connection.client() as client:
+            info = client.map(map_ref)
 
         async def work(advance: Callable[[], None]) -> None:
-            nonlocal asked
             async with connection.async_client() as client:
                 for picture in opened.pictures(topics):
-                    asked += 1
-                    found = await _pose(client, opened, picture, map_ref, query, frame)
-                    poses.extend(() if found is None else (found,))
+                    device_from_cam = _device_from_cam(opened, picture, frame)
+                    if device_from_cam is not None:
+                        ask = partial(_ask, client, opened, picture, info.ref, query.options)
+                        try:
+                            found = await ask_patiently(ask)
+                        except VislocError as error:
+                            raise_unless_of_one(error)
+                            failed.append(error)
+                        else:
+                            if found is not None:
+                                poses.append(stamped(picture.time_ns, found, device_from_cam))
                     advance()
 
-        run_with_progress(_err, work, "photos", opened.count(topics), "nothing was written")
+        asked = opened.count(topics)
+        run_with_progress(_err, work, "photos", asked, "nothing was written")
     write_poses(output, "/visloc/pose", world, poses, ros1=output.suffix == ".bag")
-    _err.print(f"{len(poses)} of {asked} photos localized; poses: {output}", highlight=False)
+    counts = f"{len(poses)} of {asked} photos localized"
+    _err.print(f"{counts}; poses: {output}", highlight=False, soft_wrap=True)
+    if failed:
+        told = f"{len(failed)} photos, the first: [{failed[0].code}] {failed[0]}"
+        print_line(_err, "no answer", told, "yellow")
+    if not info.metric:
+        print_line(_err, "unit", "of the map, which is not known to be a metre", "yellow")
     if not poses:
         raise typer.Exit(3)
 
@@ -88,25 +113,21 @@ def _chosen(opened: Bag, topics: list[str] | None) -> tuple[str, ...]:
     return tuple(topics) if topics else opened.photos
 
 
-async def _pose(
-    client: AsyncClient,
-    opened: Bag,
-    picture: Picture,
-    map_ref: str,
-    query: QueryOptions,
-    frame: str | None,
-) -> PoseStamped | None:
+def _device_from_cam(opened: Bag, picture: Picture, frame: str | None) -> Pose | None:
+    """Return how a camera lies to the frame that is asked for; None if that is not known then."""
+    if frame is None:
+        return Pose.identity()
+    if not opened.transforms.connects(frame, picture.frame):
+        raise refuse("bag.frame", field="--frame", expected=picture.frame, got=frame)
+    return opened.transforms.pose(frame, picture.frame, picture.time_ns)
+
+
+async def _ask(
+    client: AsyncClient, opened: Bag, picture: Picture, map_ref: str, options: LocalizeOptions
+) -> PoseEstimate | None:
     camera = opened.cameras[picture.topic]
-    answer = await client.localize(picture.file(), map_ref, camera, query.options)
-    if not answer.localized or answer.pose is None:
-        return None
-    device_from_cam = Pose.identity()
-    if frame is not None:
-        known = opened.transforms.pose(frame, picture.frame, picture.time_ns)
-        if known is None:
-            raise refuse("bag.frame", field="--frame", expected=picture.frame, got=frame)
-        device_from_cam = known
-    return stamped(picture.time_ns, answer.pose, device_from_cam)
+    answer = await client.localize(picture.file(), map_ref, camera, options)
+    return answer.pose
 
 
 def stamped(time_ns: int, pose: PoseEstimate, device_from_cam: Pose) -> PoseStamped:

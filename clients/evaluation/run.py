@@ -106,11 +106,11 @@ class QueryClient:
             options = self._options([query])
             sent = await asyncio.to_thread(self.read, query)
             started = time.perf_counter()
-            result = await _ask_patiently(
+            result = await ask_patiently(
                 lambda: self.client.localize(sent, self.map_ref, query.camera, options)
             )
         except VislocError as error:
-            _raise_unless_of_one(error)
+            raise_unless_of_one(error)
             return Outcome(query, None, error, time.perf_counter() - started)
         return Outcome(query, result, None, time.perf_counter() - started)
 
@@ -129,13 +129,13 @@ class QueryClient:
         try:
             if images:
                 options = self._options(instant.photos)
-                result = await _ask_patiently(
+                result = await ask_patiently(
                     lambda: self.client.localize_rig(
                         images.values(), self.map_ref, instant.rig, options
                     )
                 )
         except VislocError as error:
-            _raise_unless_of_one(error)
+            raise_unless_of_one(error)
             errors |= dict.fromkeys(images, error)
         seconds = time.perf_counter() - started
         results: dict[str, LocalizeResult] = {}
@@ -172,7 +172,7 @@ class QueryClient:
             try:
                 sent = await asyncio.to_thread(self.read, query)
             except VislocError as error:
-                _raise_unless_of_one(error)
+                raise_unless_of_one(error)
                 errors[query.name] = error
             else:
                 images[query.name] = RigImage(query.sensor, sent, query.camera, query.timestamp)
@@ -224,7 +224,7 @@ def _take_answer(
             results[name] = parse_answer(server, photo_result, result, index)
 
 
-def _raise_unless_of_one(error: VislocError) -> None:
+def raise_unless_of_one(error: VislocError) -> None:
     """Raise an error that does not concern one photo or instant only."""
     if isinstance(error, InvalidInput) and not isinstance(error, WeightsError):
         is_of_one = not error.code.startswith(_CODES_OF_ALL_PHOTOS)
@@ -234,7 +234,8 @@ def _raise_unless_of_one(error: VislocError) -> None:
         raise error
 
 
-async def _ask_patiently(ask: Callable[[], Awaitable[_T]]) -> _T:
+async def ask_patiently(ask: Callable[[], Awaitable[_T]]) -> _T:
+    """Ask again, after waits, while the server is overloaded."""
     for wait_s in _RETRY_AFTER_S:
         try:
             return await ask()

@@ -6,7 +6,9 @@ the outermost frame above the cameras, such as ``map`` or ``odom`` (REP 105).
 
 from __future__ import annotations
 
+import itertools
 import re
+import shutil
 from bisect import bisect_left
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
@@ -20,7 +22,7 @@ from mapping.importers.dataset import depth_sensor_id
 from mapping.importers.model import ImportedImage, ImportedModel
 from mapping.importers.reading.photo_names import photo_size
 from mapping.stages.depth import DEFAULT_DEPTH_SCALE
-from visloc.errors import refuse
+from visloc.errors import DatasetError, refuse
 from visloc.geometry import Camera, Pose, rotation_angle
 from visloc.kapture import Sensor
 from visloc.kapture.dataset import UNKNOWN_CAMERA
@@ -31,6 +33,7 @@ _STEP_M, _TURN_RAD = 0.25, np.radians(10.0)
 # Without poses, when so long has passed.
 _STEP_NS = 500_000_000
 _SAME_TIME_NS = 20_000_000  # a depth picture of the same moment
+_MOST_UNITS = np.iinfo(np.uint16).max
 
 
 @dataclass(slots=True)
@@ -38,25 +41,25 @@ class _Topic:
     """A topic of photos, and what was taken of it.
 
     Attributes:
+        sensor: its id in the dataset, and the folder of its photos.
         last: the photo that was taken last: its time, and ``world_from_cam``.
     """
 
     name: str
+    sensor: str
     world: str | None = None
     last: tuple[int, Pose | None] | None = None
     seen: int = 0
     unposed: int = 0
+    unreadable: int = 0
     frame: str = ""
     size: tuple[int, int] | None = None
     images: list[ImportedImage] = field(default_factory=list)
-
-    @property
-    def sensor(self) -> str:
-        return re.sub(r"[^\w.-]+", "_", self.name.strip("/"))
+    times: set[int] = field(default_factory=set)
 
 
 def read(path: Path, photos: Path | None = None) -> ImportedModel:
-    """Read a bag, and write its photos.
+    """Read a bag, and write its photos; a new folder of photos is removed if this fails.
 
     Args:
         path: a ``.bag`` of ROS 1, or the folder of a ROS 2 bag.
@@ -68,13 +71,40 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
     """
     with open_bag(path) as bag:
         if not bag.photos:
-            raise refuse("bag.no_photos", field=str(path))
+            got = ", ".join(f"{topic}: {encoding}" for topic, encoding in bag.left_out.items())
+            raise refuse("bag.no_photos", field=str(path), got=got or None)
+        path = path.resolve()  # "." has no name
         folder = path.with_name(f"{path.stem}_photos") if photos is None else photos
-        topics = {name: _Topic(name) for name in bag.photos}
-        for picture in bag.pictures(bag.photos):
-            _take(bag, topics[picture.topic], picture, folder)
-        depth_topics = _add_depth(bag, topics.values(), folder)
-        return _model(bag, list(topics.values()), depth_topics, folder)
+        is_new = not folder.exists()
+        try:
+            return _read(bag, folder)
+        except BaseException:
+            if is_new:
+                shutil.rmtree(folder, ignore_errors=True)
+            raise
+
+
+def _read(bag: Bag, folder: Path) -> ImportedModel:
+    topics = {name: _Topic(name, sensor) for name, sensor in _sensors(bag.photos).items()}
+    for picture in bag.pictures(bag.photos):
+        _take(bag, topics[picture.topic], picture, folder)
+    for topic in topics.values():
+        topic.images.sort(key=lambda image: image.timestamp)  # bags are in order of arrival
+    depth_topics = _add_depth(bag, topics.values(), folder)
+    return _model(bag, list(topics.values()), depth_topics, folder)
+
+
+def _sensors(topics: Iterable[str]) -> dict[str, str]:
+    """Return the sensor of each topic; its id is also the name of a folder, so no path."""
+    named: dict[str, str] = {}
+    taken: set[str] = set()
+    for topic in topics:
+        base = re.sub(r"[^\w.-]+", "_", topic.strip("/")).strip(".") or "camera"
+        names = itertools.chain([base], (f"{base}-{number}" for number in itertools.count(2)))
+        name = next(each for each in names if not taken & {each, depth_sensor_id(each)})
+        named[topic] = name
+        taken |= {name, depth_sensor_id(name)}
+    return named
 
 
 def _take(bag: Bag, topic: _Topic, picture: Picture, folder: Path) -> None:
@@ -90,14 +120,17 @@ def _take(bag: Bag, topic: _Topic, picture: Picture, folder: Path) -> None:
         if world_from_cam is None:
             topic.unposed += 1
             return
-    if not _is_new(topic.last, picture.time_ns, world_from_cam):
+    if picture.time_ns in topic.times or not _is_new(topic.last, picture.time_ns, world_from_cam):
         return
     name = f"{topic.sensor}/{picture.time_ns}{_suffix(picture)}"
     _write(folder / name, picture)
-    size = photo_size(folder / name)
-    if size is None:
-        raise refuse("bag.picture", field=topic.name, expected="JPEG or PNG", got="neither")
-    topic.size = size
+    try:
+        topic.size = photo_size(folder / name)
+    except DatasetError:  # one broken photo of an hour
+        (folder / name).unlink()
+        topic.unreadable += 1
+        return
+    topic.times.add(picture.time_ns)
     topic.last = picture.time_ns, world_from_cam
     pose = None if world_from_cam is None else world_from_cam.inverse()
     topic.images.append(ImportedImage(name, topic.sensor, picture.time_ns, pose))
@@ -107,9 +140,7 @@ def _is_new(last: tuple[int, Pose | None] | None, time_ns: int, pose: Pose | Non
     if last is None:
         return True
     if pose is None or last[1] is None:
-        return time_ns - last[0] >= _STEP_NS
-    if time_ns == last[0]:
-        return False
+        return abs(time_ns - last[0]) >= _STEP_NS
     moved = float(np.linalg.norm(pose.translation - last[1].translation))
     return moved >= _STEP_M or rotation_angle(pose.rotation @ last[1].rotation.T) >= _TURN_RAD
 
@@ -149,7 +180,8 @@ def _add_depth(bag: Bag, topics: Iterable[_Topic], folder: Path) -> dict[str, st
                 image = topic.images[index]
                 name = f"{depth_sensor_id(topic.sensor)}/{image.timestamp}.png"
                 units = np.round(depth_in_metres(message, depth) / DEFAULT_DEPTH_SCALE)
-                _write_depth(folder / name, np.clip(units, 0, 65535).astype(np.uint16))
+                units[units > _MOST_UNITS] = 0  # further than a depth map can say
+                _write_depth(folder / name, units.astype(np.uint16))
                 topic.images[index] = replace(image, depth=name)
                 found[topic.sensor] = depth
     return found
@@ -167,12 +199,17 @@ def _model(
     bag: Bag, topics: list[_Topic], depth_topics: dict[str, str], folder: Path
 ) -> ImportedModel:
     sensors: dict[str, Sensor] = {}
-    notes = []
+    notes = [
+        f"{topic}: left out, its encoding {encoding!r} is not supported"
+        for topic, encoding in bag.left_out.items()
+    ]
     for topic in topics:
         taken = len(topic.images)
         notes.append(f"{topic.name}: {taken} of {topic.seen} photos taken, written to {folder}")
         if topic.unposed:
             notes.append(f"{topic.name}: {topic.unposed} photos lie outside the time of tf")
+        if topic.unreadable:
+            notes.append(f"{topic.name}: {topic.unreadable} photos cannot be read")
         if topic.world is None:
             notes.append(f"{topic.name}: nothing tells how its frame {topic.frame!r} moves")
         else:

@@ -18,7 +18,7 @@ import pytest
 
 from clients import AsyncClient, Client, Instant, Odometry, PoseSource, RigImage, RigSensor
 from clients.cli.main import main
-from tests.rosbags_made import BASE, BASE_FROM_OPTICAL, write_bag
+from tests.rosbags_made import BASE, BASE_FROM_OPTICAL, SECOND, Made, write_bag, write_messages
 from visloc.errors import InvalidInput
 from visloc.evaluation import pose_error
 from visloc.geometry import Pose
@@ -249,3 +249,54 @@ def test_a_bag_becomes_a_bag_of_poses(
         np.testing.assert_allclose(found.translation, base_in_map.translation, atol=0.05)
         np.testing.assert_allclose(found.rotation, base_in_map.rotation, atol=0.05)
         assert np.linalg.eigvalsh(np.reshape(message.pose.covariance, (6, 6))).min() > 0
+
+
+def test_one_broken_photo_of_a_bag_does_not_cost_the_others(
+    doors: tuple[str, str], sample: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    queries, made = read_dataset(sample / "query"), Made(False)
+    good = queries.path_of(queries.images[0]).read_bytes()
+    kind = "sensor_msgs/msg/CompressedImage"
+    files = [
+        ("/c/compressed", kind, second, made.file(second * SECOND, "camera", file))
+        for second, file in ((1, b"no photo"), (2, good))
+    ]
+    write_messages(tmp_path / "bag", made, files)
+    asked = ["bag", str(tmp_path / "bag"), "--map", "room", "--server", doors[0]]
+
+    with pytest.raises(SystemExit) as ended:
+        main([*asked, "--output", str(tmp_path / "poses")])
+
+    assert ended.value.code == 0
+    told = capsys.readouterr().err
+    assert "1 of 2 photos localized" in told
+    assert "no answer      1 photos, the first: [image." in told
+    for wrong, code in (
+        (["--frame", "base_link"], "bag.frame"),
+        (["--output", str(tmp_path / "no" / "poses")], "output.folder"),
+        (["--output", str(tmp_path / "poses")], "bag.exists"),
+        (["--topic", "/d"], "bag.topic"),
+    ):
+        with pytest.raises(SystemExit) as ended:
+            main([*asked, "--output", str(tmp_path / "other"), *wrong])
+        assert ended.value.code == 1
+        assert code in capsys.readouterr().err
+
+
+def test_poses_of_two_cameras_need_a_frame(
+    doors: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = Made(False)
+    kind = "sensor_msgs/msg/CompressedImage"
+    files = [(f"/{c}/compressed", kind, 1, made.file(SECOND, c, b"photo")) for c in "ab"]
+    write_messages(tmp_path / "bag", made, files)
+
+    with pytest.raises(SystemExit) as ended:
+        main(
+            [
+                *("bag", str(tmp_path / "bag"), "--map", "room"),
+                *("--output", str(tmp_path / "poses"), "--server", doors[0]),
+            ]
+        )
+    assert ended.value.code == 1
+    assert "bag.cameras" in capsys.readouterr().err

@@ -27,6 +27,7 @@ from visloc.localization.evidence import Shown
 from visloc.localization.feature_cache import FeatureCache, find_features
 from visloc.localization.fingerprints import check_fingerprint
 from visloc.localization.named_photos import NamedPhotos
+from visloc.localization.photo_answer import photo_answer
 from visloc.localization.places import solve_photo
 from visloc.localization.query_camera import query_resolution, resolve_camera
 from visloc.localization.query_features import (
@@ -64,7 +65,6 @@ from visloc.types import (
     Evidence,
     LocalFeatures,
     Localized,
-    NotLocalized,
     QueryFeatures,
     Reason,
     Refusal,
@@ -324,37 +324,13 @@ class Localizer:
             The answer, and for each match (n,) whether the best pose explains it, even if that pose
             was refused.
         """
-        return self._told(look, self.solve([SeenImage.alone(look)], options, priors))
+        solved = self.solve([SeenImage.alone(look)], options, priors)
+        return photo_answer(look, solved, self.geometry.origin)
 
     def _answer(self, look: Look, options: LocalizeOptions, priors: Priors) -> Answer:
         """Find the pose of one photo."""
         image, solved = solve_photo(SeenImage.alone(look), self.geometry, options, priors)
-        return self._told(image.look or look, solved)[0]
-
-    def _told(self, look: Look, solved: Solved) -> tuple[Answer, NDArray[np.bool_]]:
-        answer, pose, refusal = solved.answer, solved.answer.pose, solved.answer.refusal
-        none = np.zeros(len(look.matches.pixels), dtype=np.bool_)
-        inliers = solved.inliers[0] if solved.inliers else none
-        (image,) = answer.images
-        assert image.evidence is not None  # it was looked at
-        evidence = replace(image.evidence, seconds=answer.seconds)
-        if refusal is not None or pose is None or pose.photo_covariance is None:
-            assert refusal is not None  # without a pose there is a reason
-            told = (refusal.stage, refusal.reason, refusal.message, refusal.candidates)
-            return NotLocalized(evidence, *told, coarse=answer.coarse), inliers
-        localized = Localized(
-            evidence=evidence,
-            cam_from_world=pose.rig_from_world,
-            covariance=pose.covariance,
-            position_std=pose.position_std,
-            orientation_std=pose.orientation_std,
-            inlier_keypoints=(look.matches.pixels[inliers] * look.reduced).astype(np.float32),
-            inlier_points=look.matches.points[inliers] + self.geometry.origin,
-            photo_covariance=pose.photo_covariance,
-            uncertainty=pose.uncertainty,
-            probability=pose.probability,
-        )
-        return localized, inliers
+        return photo_answer(image.look or look, solved, self.geometry.origin)[0]
 
     def _match(
         self,

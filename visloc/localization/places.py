@@ -117,7 +117,12 @@ def look_at_one_place(
             best = pose
     if best is None:
         return None
-    near = _photos_near(best.rig_from_world, geometry, constraints.photo_weights)
+    weights, among = constraints.photo_weights, np.arange(len(geometry.centers))
+    if options.photos is not None:
+        among = proposed.photos  # who named photos gets no others matched
+    elif weights is not None:
+        among = np.flatnonzero(weights > 0.0)
+    near = _photos_near(best.rig_from_world, geometry, among)
     if len(near) == 0:
         return None
     proposed = proposed.matched_with(near, geometry)
@@ -149,8 +154,8 @@ def _is_worth_it(look: Look, reason: Reason, options: LocalizeOptions) -> bool:
 
 def _places(photos: NDArray[np.int64], geometry: MapGeometry) -> Iterator[NDArray[np.int64]]:
     """Yield groups of searched photos that look at about the same, those of better rank first."""
-    viewpoints = geometry.viewpoints
-    apart = np.stack([viewpoints.apart_from(viewpoints.pose(photo))[photos] for photo in photos])
+    viewpoints = geometry.viewpoints.of(photos)
+    apart = np.stack([viewpoints.apart_from(viewpoints.pose(row)) for row in range(len(photos))])
     votes = 1.0 / (np.arange(len(photos)) + _FIRST_RANK)
     left = np.ones(len(photos), dtype=np.bool_)
     for _ in range(_MAX_PLACES):
@@ -181,15 +186,11 @@ def _solved(
     return pose
 
 
-def _photos_near(
-    pose: Pose, geometry: MapGeometry, weights: NDArray[np.float64] | None
-) -> NDArray[np.int64]:
-    """Return the photos that look at about what a camera at a pose sees, nearest first."""
-    apart = geometry.viewpoints.apart_from(pose)
-    if weights is not None:
-        apart = np.where(weights > 0.0, apart, np.inf)
+def _photos_near(pose: Pose, geometry: MapGeometry, among: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the photos of some that look at about what a camera at a pose sees, nearest first."""
+    apart = geometry.viewpoints.of(among).apart_from(pose)
     nearest = np.argsort(apart, kind="stable")[:_MAX_NEAR]
-    return nearest[apart[nearest] <= _NEAR]
+    return among[nearest[apart[nearest] <= _NEAR]]
 
 
 def _rows_of(proposed: Proposed, photos: NDArray[np.int64]) -> NDArray[np.intp]:

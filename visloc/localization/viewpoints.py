@@ -28,6 +28,10 @@ class Viewpoints:
     def __len__(self) -> int:
         return len(self.centers)
 
+    def of(self, images: NDArray[np.int64]) -> Viewpoints:
+        """Those of some photos."""
+        return Viewpoints(self.centers[images], self.rotations[images], self.reach)
+
     def pose(self, image: int) -> Pose:
         """``cam_from_local`` of one photo."""
         rotation = self.rotations[image]

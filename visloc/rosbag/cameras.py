@@ -12,8 +12,10 @@ from visloc.geometry import Camera
 _CORNER = 0.5  # ROS, as OpenCV, counts from the centre of the top-left pixel
 
 
-def camera_from_info(info: Any, topic: str) -> Camera | None:
+def camera_from_info(info: Any, topic: str, *, rectified: bool = False) -> Camera | None:
     """Return the camera of raw pictures; None where it was not calibrated (K is zero).
+
+    That of rectified pictures is P, without distortion.
 
     ``plumb_bob`` and ``rational_polynomial`` are OpenCV's models of 5 and 8 numbers,
     ``equidistant`` its fisheye model (REP 104 and sensor_msgs/distortion_models).
@@ -21,8 +23,13 @@ def camera_from_info(info: Any, topic: str) -> Camera | None:
     Raises:
         DatasetError: ``bag.camera``: a distortion model that we lack; ``camera.*``.
     """
-    k = np.asarray(getattr(info, "K" if hasattr(info, "K") else "k"), np.float64).reshape(3, 3)
-    d = np.asarray(getattr(info, "D" if hasattr(info, "D") else "d"), np.float64)
+    k, d, p = (  # ROS 1 wrote them in capitals
+        np.asarray(getattr(info, name.upper() if hasattr(info, name.upper()) else name), np.float64)
+        for name in ("k", "d", "p")
+    )
+    k, p = k.reshape(3, 3), p.reshape(3, 4)
+    if rectified and p[0, 0] != 0:
+        k, d = p[:, :3], d[:0]
     if k[0, 0] == 0:
         return None
     pinhole = (k[0, 0], k[1, 1], k[0, 2] + _CORNER, k[1, 2] + _CORNER)

@@ -57,6 +57,11 @@ def is_depth(message: Any) -> bool:
     return getattr(message, "encoding", "") in _DEPTHS
 
 
+def has_known_colors(message: Any) -> bool:
+    """Tell whether ``pixels_of`` knows the encoding of an ``Image``."""
+    return getattr(message, "encoding", "") in _COLORS
+
+
 def pixels_of(message: Any, topic: str) -> NDArray[np.uint8]:
     """Return the pixels of an ``Image``, (H, W, 3) RGB or (H, W) grey.
 

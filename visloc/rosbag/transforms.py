@@ -8,6 +8,9 @@ from dataclasses import dataclass, field
 from visloc.geometry import Pose
 from visloc.sequences.filling import interpolate_pose
 
+# Between poses further apart nobody knows how the frame moved: tf2 keeps as much by default.
+_LONGEST_GAP_NS = 10_000_000_000
+
 
 @dataclass(slots=True)
 class _Edge:
@@ -42,6 +45,10 @@ class Transforms:
         """Tell whether the frame has a parent."""
         return child in self._edges
 
+    def connects(self, a: str, b: str) -> bool:
+        """Tell whether two frames are of one tree."""
+        return self.root_of(a) == self.root_of(b)
+
     def root_of(self, frame: str) -> str:
         """Return the outermost frame above a frame, which is the frame itself if it has none."""
         path = self._path(frame)
@@ -54,7 +61,8 @@ class Transforms:
     def pose(self, target: str, frame: str, time_ns: int) -> Pose | None:
         """Return ``target_from_frame`` at a time, interpolated.
 
-        None where the frames are not connected or the time is not covered.
+        None where the frames are not connected, or nothing is known within 10 s of each other
+        around the time.
         """
         ups, target_ups = self._path(frame), self._path(target)
         common = next((each for each in ups if each in target_ups), None)
@@ -90,6 +98,8 @@ class Transforms:
         if after in (0, len(edge.times)):
             return None
         first, second = edge.times[after - 1], edge.times[after]
+        if second - first > _LONGEST_GAP_NS:
+            return None
         share = (time_ns - first) / (second - first)
         before, behind = edge.poses[after - 1].inverse(), edge.poses[after].inverse()
         return interpolate_pose(before, behind, share).inverse()

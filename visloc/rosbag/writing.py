@@ -68,18 +68,20 @@ def write_poses(
     store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
     kind = "geometry_msgs/msg/PoseWithCovarianceStamped"
     partial = path.with_name(f".{path.name}.partial")
-    _remove(partial)
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir()
+    written = partial / path.name  # ROS 2 names the files in a bag after it
     try:
-        opened: Any = rosbag1.Writer(partial) if ros1 else rosbag2.Writer(partial, version=8)
+        opened: Any = rosbag1.Writer(written) if ros1 else rosbag2.Writer(written, version=8)
         with opened as writer:
             connection = writer.add_connection(topic, kind, typestore=store)
             for number, pose in enumerate(poses):
                 message = _message(store, pose, frame, {"seq": number} if ros1 else {})
                 encode = store.serialize_ros1 if ros1 else store.serialize_cdr
                 writer.write(connection, pose.time_ns, encode(message, kind))
-        partial.rename(path)
+        written.rename(path)
     finally:
-        _remove(partial)
+        shutil.rmtree(partial, ignore_errors=True)
 
 
 def _message(store: Any, pose: PoseStamped, frame: str, numbered: dict[str, int]) -> Any:
@@ -102,10 +104,3 @@ def _message(store: Any, pose: PoseStamped, frame: str, numbered: dict[str, int]
         header=new("std_msgs/msg/Header", stamp=stamp, frame_id=frame, **numbered),
         pose=new("geometry_msgs/msg/PoseWithCovariance", pose=at, covariance=stated),
     )
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)

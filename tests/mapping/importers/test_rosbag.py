@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from mapping.importers import import_dataset
 from mapping.stages.depth import read_depth
-from tests.rosbags_made import SECOND, write_bag
+from tests.rosbags_made import SECOND, Made, write_bag, write_messages
 from visloc.errors import DatasetError
+from visloc.geometry import Camera
 from visloc.kapture import Dataset, FileRecord, read_dataset
 
 
@@ -90,3 +92,88 @@ def test_a_damaged_bag_leaves_no_dataset(sample: Path, tmp_path: Path) -> None:
         import_dataset("rosbag", bag, tmp_path / "dataset")
     assert error.value.code == "bag.unreadable"
     assert not (tmp_path / "dataset").exists()
+    assert not (tmp_path / "walk_photos").exists()
+
+
+IMAGE = "sensor_msgs/msg/Image"
+PIXELS = np.zeros((48, 64, 3), np.uint8)
+
+
+def test_photos_that_were_written_go_if_the_import_fails(tmp_path: Path) -> None:
+    made = Made(False)
+    torn = made.image(2 * SECOND, "camera", PIXELS, "rgb8")
+    torn.data = torn.data[:50]
+    good = made.image(SECOND, "camera", PIXELS, "rgb8")
+    write_messages(tmp_path / "bag", made, [("/c", IMAGE, 1, good), ("/c", IMAGE, 2, torn)])
+
+    with pytest.raises(DatasetError) as error:
+        import_dataset("rosbag", tmp_path / "bag", tmp_path / "dataset")
+    assert error.value.code == "bag.picture"
+    assert not (tmp_path / "bag_photos").exists()
+
+    (tmp_path / "bag_photos").mkdir()  # of somebody else
+    with pytest.raises(DatasetError):
+        import_dataset("rosbag", tmp_path / "bag", tmp_path / "dataset")
+    assert (tmp_path / "bag_photos").exists()
+
+
+def test_topics_name_folders_but_no_paths_and_never_the_same(tmp_path: Path) -> None:
+    made = Made(True)
+    topics = ["/a/b", "/a_b", "/..", "/", "/a_b_depth"]
+    photo = made.image(SECOND, "camera", PIXELS, "rgb8")
+    bag = tmp_path / "in" / "x.bag"
+    bag.parent.mkdir()
+    write_messages(bag, made, [(topic, IMAGE, 1, photo) for topic in topics])
+
+    summary = import_dataset("rosbag", bag, tmp_path / "dataset")
+
+    assert summary.images == len(topics)
+    photos = bag.parent / "x_photos"
+    names = sorted(str(path.relative_to(photos).parent) for path in photos.rglob("*.png"))
+    assert names == ["a_b", "a_b-2", "a_b_depth-2", "camera", "camera-2"]
+    assert sorted(path.name for path in bag.parent.iterdir()) == ["x.bag", "x_photos"]
+
+
+def test_a_broken_photo_and_one_of_the_same_time_are_left_out(tmp_path: Path) -> None:
+    made = Made(False)
+    jpeg = cv2.imencode(".jpg", PIXELS)[1].tobytes()
+    kind = "sensor_msgs/msg/CompressedImage"
+    files = [(1, jpeg), (2, b"no photo"), (3, jpeg), (3, jpeg), (2, jpeg), (9, jpeg)]
+    write_messages(
+        tmp_path / "bag",
+        made,
+        [
+            ("/c/compressed", kind, number, made.file(second * SECOND, "camera", file))
+            for number, (second, file) in enumerate(files)
+        ],
+    )
+
+    summary = import_dataset("rosbag", tmp_path / "bag", tmp_path / "dataset")
+
+    dataset = read_dataset(tmp_path / "dataset")
+    assert [record.timestamp for record in dataset.images] == [s * SECOND for s in (1, 2, 3, 9)]
+    assert "/c/compressed: 1 photos cannot be read" in summary.notes
+
+
+def test_depth_beyond_what_a_depth_map_can_say_is_unknown(tmp_path: Path) -> None:
+    made = Made(False)
+    metres = np.full((48, 64), 2.0, np.float32)
+    metres[0] = 100.0
+    camera = Camera("PINHOLE", 64, 48, (60.0, 60.0, 32.0, 24.0))
+    info = "sensor_msgs/msg/CameraInfo"
+    write_messages(
+        tmp_path / "bag",
+        made,
+        [
+            ("/c/image", IMAGE, 1, made.image(SECOND, "camera", PIXELS, "rgb8")),
+            ("/c/camera_info", info, 1, made.info(SECOND, "camera", camera)),
+            ("/d/image", IMAGE, 1, made.image(SECOND, "camera", metres, "32FC1")),
+        ],
+    )
+
+    import_dataset("rosbag", tmp_path / "bag", tmp_path / "dataset")
+
+    dataset = read_dataset(tmp_path / "dataset")
+    units = cv2.imread(str(dataset.path_of(dataset.depth_maps[0])), cv2.IMREAD_UNCHANGED)
+    assert (units[0] == 0).all()
+    assert (units[1:] == 2000).all()

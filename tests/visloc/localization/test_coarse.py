@@ -72,6 +72,9 @@ def test_it_is_told_only_where_it_is_asked_for_and_no_pose_is_found(
     refused = localizer.localize(photo, query.camera, replace(REFUSED, fallback=Fallback.NONE))
     assert isinstance(refused, NotLocalized)
     assert refused.coarse is None
+    assert refused.status == "not_localized"
+    approximated = localizer.localize(photo, query.camera, REFUSED)
+    assert approximated.status == "coarse"  # as over HTTP and gRPC
     accepted = localizer.localize(photo, query.camera, LocalizeOptions(fallback=Fallback.COARSE))
     assert isinstance(accepted, Localized)
 

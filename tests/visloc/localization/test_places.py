@@ -154,3 +154,20 @@ def test_no_second_look_where_the_first_one_says_enough(
     look = seen_at_night(room, query, 150)
     look = replace(look, evidence=replace(look.evidence, camera_source=source))
     assert look_at_one_place(look, reason, room.geometry, options, NO_PRIORS) is None
+
+
+def test_who_names_photos_gets_no_others_matched(room: Localizer, query: Query) -> None:
+    look = seen_at_night(room, query, 150)
+    assert look.proposed is not None
+    named = tuple(room.map.images[photo].name for photo in look.proposed.photos)
+    asked = Reason.LOW_INLIER_RATIO, room.geometry
+
+    free = look_at_one_place(look, *asked, OPTIONS, NO_PRIORS)
+    bound = look_at_one_place(look, *asked, LocalizeOptions(photos=named), NO_PRIORS)
+
+    assert free is not None
+    assert free.proposed is not None
+    assert len(free.proposed.photos) > len(look.proposed.photos)
+    assert bound is not None
+    assert bound.proposed is not None
+    assert bound.proposed.photos.tolist() == look.proposed.photos.tolist()

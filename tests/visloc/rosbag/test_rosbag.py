@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.rosbags_made import SECOND, Made, write_messages
 from visloc.errors import Conflict, DatasetError
 from visloc.geometry import Camera, Pose
 from visloc.pose.colmap import project
@@ -68,6 +69,16 @@ def test_poses_between_two_times_are_interpolated_and_none_is_guessed_outside() 
     assert tree.pose("odom", "base", 15) is None
 
 
+def test_over_a_long_gap_nothing_is_interpolated() -> None:
+    tree = Transforms()
+    for second in (10, 20, 31):
+        tree.add("map", "base", second * SECOND, Pose.identity())
+
+    assert tree.pose("map", "base", 15 * SECOND) is not None
+    assert tree.pose("map", "base", 25 * SECOND) is None
+    assert tree.pose("map", "base", 31 * SECOND) is not None
+
+
 def test_a_circle_of_frames_ends() -> None:
     tree = Transforms()
     tree.add("a", "b", None, Pose.identity())
@@ -81,7 +92,10 @@ def test_a_circle_of_frames_ends() -> None:
 
 def info(model: str, d: list[float], width: int = 640, height: int = 480) -> Any:
     k = np.array([500.0, 0, 319.5, 0, 510, 239.5, 0, 0, 1])
-    return SimpleNamespace(width=width, height=height, distortion_model=model, k=k, d=np.array(d))
+    p = np.array([450.0, 0, 310.5, -40, 0, 460, 229.5, 0, 0, 0, 1, 0])
+    return SimpleNamespace(
+        width=width, height=height, distortion_model=model, k=k, d=np.array(d), p=p
+    )
 
 
 def test_cameras_count_pixels_from_the_corner() -> None:
@@ -126,6 +140,17 @@ def test_an_unknown_model_is_named_and_no_calibration_is_no_camera() -> None:
     uncalibrated = info("plumb_bob", [])
     uncalibrated.k = np.zeros(9)
     assert camera_from_info(uncalibrated, "/c") is None
+
+
+def test_rectified_pictures_have_the_camera_that_they_were_rectified_to() -> None:
+    given = info("plumb_bob", [0.1, -0.05, 0.001, 0.002, 0.0])
+
+    camera = camera_from_info(given, "/c", rectified=True)
+    assert camera == Camera("PINHOLE", 640, 480, (450.0, 460.0, 311.0, 230.0))
+    given.p[:] = 0  # of drivers that calibrate but do not rectify
+    unknown = camera_from_info(given, "/c", rectified=True)
+    assert unknown is not None
+    assert unknown.model == "OPENCV"
 
 
 # Pictures
@@ -233,6 +258,9 @@ def test_what_is_written_is_read_again(tmp_path: Path, ros1: bool) -> None:
 
     write_poses(path, "/pose", "map", [PoseStamped(12_000_000_034, pose, covariance)], ros1=ros1)
 
+    assert [each.name for each in tmp_path.iterdir()] == [path.name]
+    if not ros1:  # nothing hidden, which a copy of poses/* would leave behind
+        assert {each.name for each in path.iterdir()} == {"metadata.yaml", "poses.db3"}
     with open_bag(path) as bag:
         assert bag.photos == ()
         ((topic, message),) = bag.messages(["/pose"])
@@ -261,3 +289,122 @@ def test_a_file_that_is_no_bag_is_refused(tmp_path: Path, content: bytes) -> Non
     assert error.value.code == "bag.unreadable"
     with pytest.raises(DatasetError, match="nothing there"), open_bag(tmp_path / "none.bag"):
         pass
+
+
+# Bags
+
+
+@pytest.fixture(params=[True, False], ids=["ros1", "ros2"])
+def made(request: pytest.FixtureRequest) -> Made:
+    return Made(request.param)
+
+
+_PIXELS = np.zeros((4, 6, 3), np.uint8)
+
+
+def photo_of(made: Made, topic: str, encoding: str = "rgb8") -> tuple[str, str, int, Any]:
+    pixels = _PIXELS[..., 0] if encoding.startswith("bayer") else _PIXELS
+    return topic, "sensor_msgs/msg/Image", 1, made.image(SECOND, "camera", pixels, encoding)
+
+
+def copy_of(made: Made, topic: str) -> tuple[str, str, int, Any]:
+    message = made.file(SECOND, "camera", b"\xff\xd8")
+    return f"{topic}/compressed", "sensor_msgs/msg/CompressedImage", 1, message
+
+
+def test_each_photo_comes_once_and_an_encoding_that_we_lack_is_told(
+    made: Made, tmp_path: Path
+) -> None:
+    write_messages(
+        tmp_path / "x.bag" if made.ros1 else tmp_path / "x",
+        made,
+        [
+            photo_of(made, "/left/image_raw"),
+            copy_of(made, "/left/image_raw"),
+            photo_of(made, "/right/image_raw", "bayer_rggb8"),
+            copy_of(made, "/right/image_raw"),
+        ],
+    )
+
+    with open_bag(tmp_path / "x.bag" if made.ros1 else tmp_path / "x") as bag:
+        assert bag.photos == ("/left/image_raw", "/right/image_raw/compressed")
+        assert bag.left_out == {"/right/image_raw": "bayer_rggb8"}
+        assert [picture.topic for picture in bag.pictures(bag.photos)] == list(bag.photos)
+
+
+def test_a_transform_that_is_none_is_passed_over(made: Made, tmp_path: Path) -> None:
+    path = tmp_path / ("x.bag" if made.ros1 else "x")
+    unset = made.moved(SECOND, "base", "gripper", Pose.identity())
+    unset.transforms[0].transform.rotation.w = 0.0
+    lost = made.moved(SECOND, "base", "lidar", Pose.identity())
+    lost.transforms[0].transform.translation.x = float("nan")
+    good = made.moved(SECOND, "base", "camera", Pose.identity())
+    kind = "tf2_msgs/msg/TFMessage"
+    write_messages(path, made, [("/tf", kind, 1, each) for each in (unset, lost, good)])
+
+    with open_bag(path) as bag:
+        assert bag.transforms.pose("base", "camera", SECOND) is not None
+        assert not bag.transforms.knows("gripper")
+        assert not bag.transforms.knows("lidar")
+
+
+def test_of_two_odometries_one_counts(made: Made, tmp_path: Path) -> None:
+    path = tmp_path / ("x.bag" if made.ros1 else "x")
+    kind = "nav_msgs/msg/Odometry"
+    messages = []
+    for second in (1, 2, 3):
+        for topic, x in (("/wheels", second), ("/filtered", 10.0 * second)):
+            time_ns = second * SECOND + (topic == "/filtered") * SECOND // 2
+            pose = Pose(np.eye(3), np.array([x, 0, 0]))
+            message = made.odometry(time_ns, "odom", "base", pose)
+            messages.append((topic, kind, time_ns, message))
+    write_messages(path, made, messages)
+
+    with open_bag(path) as bag:
+        found = bag.transforms.pose("odom", "base", 2 * SECOND)
+        beside = bag.transforms.pose("odom", "base", 5 * SECOND // 2)
+    assert found is not None
+    assert beside is not None
+    np.testing.assert_allclose([found.translation[0], beside.translation[0]], [2, 2.5])
+
+
+def test_ros_1_bags_may_be_compressed(tmp_path: Path) -> None:
+    from rosbags.rosbag1 import Writer
+
+    made = Made(True)
+    for way in Writer.CompressionFormat:
+        path = tmp_path / f"{way.name}.bag"
+        topic, kind, time_ns, message = photo_of(made, "/image")
+        writer = Writer(path)
+        writer.set_compression(way)
+        with writer:
+            connection = writer.add_connection(topic, kind, typestore=made.store)
+            writer.write(connection, time_ns, made.store.serialize_ros1(message, kind))
+
+        with open_bag(path) as bag:
+            (picture,) = bag.pictures(bag.photos)
+        assert picture.pixels is not None
+        np.testing.assert_array_equal(picture.pixels, _PIXELS)
+
+
+def test_damage_anywhere_is_a_refusal(made: Made, tmp_path: Path) -> None:
+    path = tmp_path / ("x.bag" if made.ros1 else "x")
+    moved = made.moved(SECOND, "map", "camera", Pose.identity())
+    tf = ("/tf", "tf2_msgs/msg/TFMessage", 1, moved)
+    write_messages(path, made, [tf, photo_of(made, "/image"), copy_of(made, "/other")])
+    file = path if made.ros1 else next(path.glob("*.db3"))
+    good = file.read_bytes()
+    random = np.random.default_rng(0)
+    refused = []
+    for _ in range(60):
+        data = bytearray(good)
+        for start in random.integers(0, len(data) - 8, 3):
+            data[start : start + 8] = random.bytes(8) if random.random() < 0.5 else b"\xff" * 8
+        file.write_bytes(data[: random.integers(len(data))] if random.random() < 0.2 else data)
+        try:
+            with open_bag(path) as bag:
+                list(bag.pictures(bag.photos))
+        except DatasetError as error:
+            refused.append(error.code)
+    assert len(refused) > 10
+    assert set(refused) <= {"bag.unreadable", "bag.picture", "bag.camera"}
