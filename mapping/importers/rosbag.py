@@ -164,7 +164,10 @@ def _write_depth(path: Path, millimetres: NDArray[np.uint16]) -> None:
 
 
 def _add_depth(bag: Bag, topics: Iterable[_Topic], folder: Path) -> dict[str, str]:
-    """Give photos the depth pictures of their frame and moment; return the topic of each sensor."""
+    """Give photos the depth pictures of their frame and moment; return the topic of each sensor.
+
+    Depth without intrinsics, its own or those of the photos, is left out.
+    """
     found: dict[str, str] = {}
     for depth in bag.depth:
         for _, message in bag.messages([depth]):
@@ -173,6 +176,8 @@ def _add_depth(bag: Bag, topics: Iterable[_Topic], folder: Path) -> dict[str, st
             time_ns = int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
             for topic in topics:
                 if topic.frame != frame or found.get(topic.sensor, depth) != depth:
+                    continue
+                if bag.cameras[depth] is None and bag.cameras[topic.name] is None:
                     continue
                 index = _nearest(topic.images, time_ns)
                 if index is None or topic.images[index].depth is not None:
@@ -203,6 +208,8 @@ def _model(
         f"{topic}: left out, its encoding {encoding!r} is not supported"
         for topic, encoding in bag.left_out.items()
     ]
+    unused = [topic for topic in bag.depth if topic not in depth_topics.values()]
+    notes += [f"{topic}: depth left out, of no photo's frame, time and camera" for topic in unused]
     for topic in topics:
         taken = len(topic.images)
         notes.append(f"{topic.name}: {taken} of {topic.seen} photos taken, written to {folder}")
@@ -220,8 +227,7 @@ def _model(
         sensors[topic.sensor] = _sensor(topic.sensor, camera, topic.size, topic.name)
         if topic.sensor in depth_topics:
             used = bag.cameras[depth_topics[topic.sensor]] or camera
-            if used is None:
-                raise refuse("bag.no_camera", field=depth_topics[topic.sensor])
+            assert used is not None  # else it was not taken
             depth = depth_sensor_id(topic.sensor)
             sensors[depth] = Sensor.with_camera(depth, used, "depth")
     worlds = {topic.world for topic in topics if topic.images}

@@ -177,3 +177,21 @@ def test_depth_beyond_what_a_depth_map_can_say_is_unknown(tmp_path: Path) -> Non
     units = cv2.imread(str(dataset.path_of(dataset.depth_maps[0])), cv2.IMREAD_UNCHANGED)
     assert (units[0] == 0).all()
     assert (units[1:] == 2000).all()
+
+
+def test_depth_without_intrinsics_is_left_out(tmp_path: Path) -> None:
+    made = Made(False)
+    depth = np.full((48, 64), 1500, np.uint16)
+    write_messages(
+        tmp_path / "bag",
+        made,
+        [
+            ("/c/image", IMAGE, 1, made.image(SECOND, "camera", PIXELS, "rgb8")),
+            ("/d/image", IMAGE, 1, made.image(SECOND, "camera", depth, "16UC1")),
+        ],
+    )
+
+    summary = import_dataset("rosbag", tmp_path / "bag", tmp_path / "dataset")
+
+    assert (summary.images, summary.depth_maps) == (1, 0)
+    assert "/d/image: depth left out, of no photo's frame, time and camera" in summary.notes
