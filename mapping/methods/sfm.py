@@ -102,7 +102,7 @@ def landmarks_from_matches(
             _placed_landmarks(dataset, photos, one, settings, metric=metric, notes=notes),
             pairs=(scene, pairs),
             doubts=doubts,
-            fixed=fixed,
+            fixed=context.features.fixed,
         )
         for one, doubts in models
     )
