@@ -289,6 +289,8 @@ BAD: list[tuple[dict[str, Any], dict[str, Any], str]] = [
     ({"keypoints": np.ones(3)}, {}, "hloc.group"),
     ({"keypoints": np.full((3, 2), np.nan)}, {}, "hloc.group"),
     ({"keypoints": np.array([[b"a", b"b"]] * 3)}, {}, "hloc.group"),
+    ({"keypoints": np.full((3, 2), 1e300)}, {}, "hloc.group"),
+    ({"keypoints": h5py.Empty("f4")}, {}, "hloc.group"),
     ({"descriptors": np.eye(4)}, {}, "hloc.group"),
     ({}, {"a.jpg/b-1.jpg/matches0": np.array([0, 1])}, "hloc.group"),
     ({}, {"a.jpg/b-1.jpg/matches0": np.array([0.0, 1, 2])}, "hloc.group"),
