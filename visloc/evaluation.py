@@ -59,7 +59,8 @@ def pose_error(estimated: Pose, truth: Pose) -> tuple[float, float]:
         The distance between the camera centres in the unit of the world (metres), and the angle
         of the rotation between the two orientations in degrees, 0 to 180.
     """
-    position_error = float(np.linalg.norm(estimated.center - truth.center))
+    with np.errstate(over="ignore", invalid="ignore"):  # infinite, or NaN, when that far away
+        position_error = float(np.linalg.norm(estimated.center - truth.center))
     orientation_error = rotation_angle(estimated.rotation @ truth.rotation.T)
     return position_error, math.degrees(orientation_error)
 
@@ -124,6 +125,7 @@ class Calibration:
         inside_95: share of the true positions inside the stated ellipsoid of 95 %.
         median_ratio: median of the error over the stated deviation, the root of the covariance's
             trace. Where the covariance is right and round it is 0.89; 0.67 where it is a line.
+            Infinite where that is zero.
     """
 
     inside_95: float
@@ -145,8 +147,13 @@ def calibration(
         return None
     inside, ratios = [], []
     for pose, covariance, truth in poses:
-        error = pose.center - truth.center
-        stated = center_covariance(pose, covariance)[3:, 3:]
+        with np.errstate(over="ignore", invalid="ignore"):
+            error = pose.center - truth.center
+            stated = center_covariance(pose, covariance)[3:, 3:]
+        if not (np.isfinite(stated).all() and np.isfinite(error).all()):
+            inside.append(bool(np.isfinite(error).all()))  # what is so uncertain may be anywhere
+            ratios.append(0.0 if inside[-1] else math.inf)
+            continue
         # The pseudo-inverse takes a covariance that is zero along an axis.
         inside.append(float(error @ np.linalg.pinv(stated) @ error) <= CHI2_95_OF_3)
         spread = math.sqrt(float(np.trace(stated)))

@@ -264,7 +264,10 @@ def _poses(modes: Mapping[str, Mapping[str, Any]], num_with_truth: int, unit: st
     )
     row(
         "error / stated std, p50",
-        ("-" if one is None else f"{one['median_ratio']:.2f}" for one in held),
+        (
+            "-" if one is None or one["median_ratio"] is None else f"{one['median_ratio']:.2f}"
+            for one in held
+        ),
     )
     return table
 

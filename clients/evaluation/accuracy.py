@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -62,7 +62,9 @@ def accuracy_of(photos: Sequence[Compared], thresholds: Sequence[Threshold]) -> 
         "median_orientation_error_of_all_deg": finite(all_orientation_deg),
         "position_error_m": _error_percentiles([position for position, _ in errors]),
         "orientation_error_deg": _error_percentiles([orientation for _, orientation in errors]),
-        "calibration": None if held is None else asdict(held),
+        "calibration": None
+        if held is None
+        else {"inside_95": held.inside_95, "median_ratio": finite(held.median_ratio)},
         "recall": _recall(errors, len(photos), thresholds),
     }
 
@@ -72,11 +74,13 @@ def finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _error_percentiles(values: Sequence[float]) -> dict[str, float] | None:
+def _error_percentiles(values: Sequence[float]) -> dict[str, float | None] | None:
     # Interpolated, so that p50 is the median above.
     if not values:
         return None
-    return {name: float(np.percentile(values, q)) for name, q in _PERCENTILES.items()}
+    with np.errstate(invalid="ignore"):  # between errors that are infinite
+        found = np.percentile(values, list(_PERCENTILES.values())).tolist()
+    return {name: finite(value) for name, value in zip(_PERCENTILES, found, strict=True)}
 
 
 def _recall(

@@ -112,7 +112,7 @@ def read_results(path: Path) -> Iterator[StoredResult]:
         for number, line in enumerate(file, start=1):
             try:
                 parsed = _parse_line(line)
-            except (KeyError, TypeError, ValueError, InvalidInput) as error:
+            except (KeyError, TypeError, ValueError, RecursionError, InvalidInput) as error:
                 raise refuse("results.line", field=f"{path}:{number}", got=str(error)) from error
             yield StoredResult(*parsed, offset, len(line))
             offset += len(line)

@@ -29,6 +29,8 @@ _RETRY_AFTER_S = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 _CODES_OF_ONE_PHOTO = ("server.internal", "server.timeout")
 # Errors that every photo would get.
 _CODES_OF_ALL_PHOTOS = ("options.", "map.", "rig.", "features.required", "features.kind")
+# Of pairs, which each photo has of its own: they name a photo that the map lacks, or too many.
+_CODE_OF_PAIRS = "options.photos"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,7 +112,7 @@ class QueryClient:
                 lambda: self.client.localize(sent, self.map_ref, query.camera, options)
             )
         except VislocError as error:
-            raise_unless_of_one(error)
+            self._raise_unless_of_one(error)
             return Outcome(query, None, error, time.perf_counter() - started)
         return Outcome(query, result, None, time.perf_counter() - started)
 
@@ -135,7 +137,7 @@ class QueryClient:
                     )
                 )
         except VislocError as error:
-            raise_unless_of_one(error)
+            self._raise_unless_of_one(error)
             errors |= dict.fromkeys(images, error)
         seconds = time.perf_counter() - started
         results: dict[str, LocalizeResult] = {}
@@ -162,6 +164,12 @@ class QueryClient:
             raise refuse("pairs.no_photo", field=queries[0].name)
         return LocalizeOptions(**self.options.given() | {"photos": list(photos)})
 
+    def _raise_unless_of_one(self, error: VislocError) -> None:
+        """Raise an error that does not concern one photo or instant only."""
+        if self.pairs is not None and error.code == _CODE_OF_PAIRS:
+            return
+        raise_unless_of_one(error)
+
     async def _read_images(
         self, instant: QueryInstant
     ) -> tuple[dict[str, RigImage], dict[str, VislocError]]:
@@ -172,7 +180,7 @@ class QueryClient:
             try:
                 sent = await asyncio.to_thread(self.read, query)
             except VislocError as error:
-                raise_unless_of_one(error)
+                self._raise_unless_of_one(error)
                 errors[query.name] = error
             else:
                 images[query.name] = RigImage(query.sensor, sent, query.camera, query.timestamp)

@@ -65,7 +65,7 @@ def _read(folder: Path, name: str, focal_lengths: Mapping[str, float]) -> Datase
             turned = Pose.from_quaternion(rotation, np.zeros(3))
         except (InvalidInput, ValueError) as error:
             raise refuse("archive.content", field=where, expected=expected, got=line) from error
-        if not np.isfinite(center).all():
+        if not np.isfinite(center).all() or photo in sensors:
             raise refuse("archive.content", field=where, expected=expected, got=line)
         if np.abs(center).max() > _FARTHEST:
             num_far += 1

@@ -53,7 +53,7 @@ def import_features(files: Sequence[Path], output: Path, type_name: str) -> Coun
                 sizes[name] = _local(file, name, group, output, type_name)
                 written["local"] += 1
             if "global_descriptor" in group:
-                vector = _array(file, name, group, "global_descriptor", 1).astype(np.float32)
+                vector = _numbers(file, name, group, "global_descriptor", 1)
                 write_global_features(output, type_name, name, vector, name=type_name)
                 written["global"] += 1
     short = _short_names(sizes)
@@ -69,14 +69,14 @@ def import_features(files: Sequence[Path], output: Path, type_name: str) -> Coun
 
 
 def _local(file: Path, name: str, group: Any, output: Path, type_name: str) -> int:
-    keypoints = _array(file, name, group, "keypoints", 2)
+    keypoints = _numbers(file, name, group, "keypoints", 2)
     if keypoints.shape[1] != 2:
         raise _wrong(file, name, "keypoints (N, 2)", keypoints.shape)
-    keypoints = keypoints.astype(np.float32) + np.float32(0.5)
+    keypoints += np.float32(0.5)
     if "descriptors" not in group:  # of matchers without a detector
         write_keypoints(output, type_name, name, keypoints, name=type_name)
         return len(keypoints)
-    descriptors = _array(file, name, group, "descriptors", 2).T.astype(np.float32)
+    descriptors = _numbers(file, name, group, "descriptors", 2).T
     if len(descriptors) != len(keypoints):
         raise _wrong(file, name, f"descriptors (D, {len(keypoints)})", descriptors.T.shape)
     write_local_features(output, type_name, name, keypoints, descriptors, name=type_name)
@@ -144,6 +144,14 @@ def _groups(file: Path) -> Iterator[tuple[str, Any]]:
             yield name, opened[name]
 
 
+def _numbers(file: Path, name: str, group: Any, key: str, num_axes: int) -> NDArray[np.float32]:
+    with np.errstate(over="ignore"):
+        values = _array(file, name, group, key, num_axes).astype(np.float32)
+    if not np.isfinite(values).all():
+        raise _wrong(file, name, f"{key} of 32-bit numbers", "larger ones")
+    return values
+
+
 def _array(file: Path, name: str, group: Any, key: str, num_axes: int) -> NDArray[Any]:
     import h5py
 
@@ -153,7 +161,7 @@ def _array(file: Path, name: str, group: Any, key: str, num_axes: int) -> NDArra
         # Linked, external and virtual arrays lie in files that whoever made this one could choose.
         if not isinstance(data, h5py.Dataset) or data.external is not None or data.is_virtual:
             raise _wrong(file, name, expected, "something else")
-        if len(data.shape) != num_axes or data.size > _MAX_VALUES:
+        if data.shape is None or len(data.shape) != num_axes or data.size > _MAX_VALUES:
             raise _wrong(file, name, expected, data.shape)
         values: NDArray[Any] = data[()]
     if values.dtype.kind not in "fiu" or not np.isfinite(values).all():

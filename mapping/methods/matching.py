@@ -8,16 +8,16 @@ pair is estimated (``mapping.methods.two_views``).
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import JsonValue
 
 from mapping.methods.fixed_things import Tally, some_keep_their_pixel
 from mapping.methods.two_views import fits_two_views
-from mapping.stages.camera_mask import CameraMask
+from mapping.stages.camera_mask import CameraMask, are_masked
 from mapping.stages.context import BuildContext
 from mapping.stages.landmarks import View
 from mapping.stages.local_features import LocalFeaturesSource
@@ -105,10 +105,12 @@ def outside_fixed(
     """Find new features outside what is fixed to the picture, by sensor, and return their context.
 
     It may have had most of the keypoints that a photo may have. Matches of another program name
-    keypoints by their rows, so these stay as they are.
+    keypoints by their rows, so these stay as they are, and their matches are left out.
     """
-    if not fixed or context.matches is not None:
+    if not fixed:
         return context
+    if context.matches is not None:
+        return replace(context, fixed=fixed)
     context = replace(context, features=context.features.outside(fixed))
     masked = [photo for photo in photos if photo.record.sensor_id in fixed]
     context.run("local features", context.features.prepare, masked)
@@ -129,7 +131,7 @@ def match_pairs(
     found_groups = _groups(photos, pairs)
     groups = [(first, seconds) for first, seconds, _ in found_groups]
     partners = [group for _, _, group in found_groups]
-    task = _MatchTask(context.work, context.features, verification, context.matches)
+    task = _MatchTask(context.work, context.features, verification, context.matches, context.fixed)
     # Usually, what is fixed was looked for among the same matches, and nothing was found.
     missing = [group for group in partners if not context.work.has(task.matches_key(group))]
     if missing:
@@ -165,16 +167,25 @@ class _MatchTask:
     features: LocalFeaturesSource
     verification: Verification
     given: MatchFiles | None = None
+    fixed: Mapping[str, CameraMask] = field(default_factory=dict)
 
     def matches_key(self, group: _Partners) -> str:
-        told = {} if self.given is None else {"given": self._hash_of_given(group)}
         return key_of(
             "matches",
             _REVISION["matches"],
             photo=self.features.key(group.photo),
             partners=[self.features.key(partner) for partner in group.partners],
-            **told,
+            **({} if self.given is None else self._given_of(group, self.given)),
         )
+
+    def _given_of(self, group: _Partners, given: MatchFiles) -> dict[str, JsonValue]:
+        """Return what the matches of another program depend on."""
+        photos = (group.photo, *group.partners)
+        masks = [self.fixed.get(photo.record.sensor_id) for photo in photos]
+        return {
+            "given": [given.digest(group.photo.name, partner.name) for partner in group.partners],
+            **({"fixed": [_cells(mask) for mask in masks]} if self.fixed else {}),
+        }
 
     def tally_key(self, group: _Partners) -> str:
         camera = group.photo.camera
@@ -208,7 +219,7 @@ class _MatchTask:
     def match(self, group: _Partners) -> None:
         def compute() -> Item:
             if self.given is not None:
-                return _item([self._given(group.photo, partner) for partner in group.partners])
+                return _item(self._given(group, self.given))
             own = round_descriptors(self.features.read(group.photo).descriptors)
             found = []
             for partner in group.partners:
@@ -220,28 +231,33 @@ class _MatchTask:
         if not self.work.has(self.matches_key(group)):
             self.work.get(self.matches_key(group), compute)
 
-    def _hash_of_given(self, group: _Partners) -> str:
-        digest = hashlib.sha256()
+    def _given(self, group: _Partners, given: MatchFiles) -> list[NDArray[np.uint32]]:
+        """Matches of another program with each partner; none for a pair that it left out."""
+        photo, found = group.photo, []
+        own = self.features.read(photo).keypoints
         for partner in group.partners:
-            rows = self._given(group.photo, partner)
-            digest.update(len(rows).to_bytes(8, "little") + rows.tobytes())
-        return digest.hexdigest()
+            rows = given.read(photo.name, partner.name)
+            if rows is None:
+                rows = np.empty((0, 2), np.int64)
+            theirs = self.features.read(partner).keypoints
+            if (rows >= (len(own), len(theirs))).any():
+                raise refuse(
+                    "kapture.match_values",
+                    field=given.label(match_file(photo.name, partner.name)),
+                    expected=f"rows of {len(own)} and {len(theirs)} keypoints",
+                    got=", ".join(map(str, rows.max(axis=0).tolist())),
+                )
+            free = self._are_free(photo, own[rows[:, 0]])
+            free &= self._are_free(partner, theirs[rows[:, 1]])
+            found.append(rows[free].astype(np.uint32))
+        return found
 
-    def _given(self, photo: MappingPhoto, partner: MappingPhoto) -> NDArray[np.uint32]:
-        """Matches of another program; none for a pair that it left out."""
-        assert self.given is not None
-        rows = self.given.read(photo.name, partner.name)
-        if rows is None:
-            return np.empty((0, 2), np.uint32)
-        counts = [len(self.features.read(each).keypoints) for each in (photo, partner)]
-        if (rows >= counts).any():
-            raise refuse(
-                "kapture.match_values",
-                field=self.given.label(match_file(photo.name, partner.name)),
-                expected=f"rows of {counts[0]} and {counts[1]} keypoints",
-                got=", ".join(map(str, rows.max(axis=0).tolist())),
-            )
-        return rows.astype(np.uint32)
+    def _are_free(self, photo: MappingPhoto, pixels: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Tell which pixels (n, 2) of a photo do not show what is fixed to the picture."""
+        mask = self.fixed.get(photo.record.sensor_id)
+        if mask is None:
+            return np.ones(len(pixels), dtype=np.bool_)
+        return ~are_masked(photo.camera, mask, pixels)
 
     def match_and_tally(self, group: _Partners) -> None:
         self.match(group)
@@ -332,6 +348,10 @@ def _rows_by_partner(item: Item) -> list[NDArray[np.uint32]]:
 def _item(found: list[NDArray[np.uint32]]) -> Item:
     offsets = np.cumsum([0, *(len(rows) for rows in found)])
     return {"offsets": offsets, "rows": np.concatenate([*found, np.empty((0, 2), np.uint32)])}
+
+
+def _cells(mask: CameraMask | None) -> JsonValue:
+    return None if mask is None else mask.tolist()
 
 
 def camera_values(camera: Camera) -> list[str | float]:

@@ -102,7 +102,7 @@ def landmarks_from_matches(
             _placed_landmarks(dataset, photos, one, settings, metric=metric, notes=notes),
             pairs=(scene, pairs),
             doubts=doubts,
-            fixed=fixed,
+            fixed=context.features.fixed,
         )
         for one, doubts in models
     )
@@ -279,8 +279,8 @@ def _notes_on_absent(
     notes = []
     if undone := sum(model.undone for model in models):
         notes.append(
-            f"{undone} pairs of photos were not used: they joined places that look alike, "
-            "and photos in the joined model missed what others beside them saw"
+            f"{undone} pairs of photos were not used: places that look alike, or something that "
+            "moved, joined them, and photos in the joined model missed what others beside them saw"
         )
     views = zip(*(model.views for model in models), strict=True)
     absent = [p.name for p, seen in zip(photos, views, strict=True) if not any(seen)]

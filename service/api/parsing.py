@@ -86,7 +86,9 @@ class OneByOne:
         started = monotonic()
         try:
             each.parsed.set_result(each.parse())
-        except Exception as error:  # noqa: BLE001  whoever waits gets it
+        # Whoever waits gets it. Also a panic of a library in Rust, which is no Exception: it would
+        # end the only thread.
+        except BaseException as error:  # noqa: BLE001
             clear_frames(error.__traceback__)  # which hold the message
             each.parsed.set_exception(error)
         finally:

@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from service.values import ONLY_SENSOR, ImageJob, Localization, Rig
-from service.workers.photos import DecodedQuery, summed
+from service.workers.photos import DecodedQuery
 from visloc.archive import Map
 from visloc.archive.places import anchor_rms
 from visloc.errors import InvalidInput, refuse
@@ -17,6 +17,7 @@ from visloc.localization.localizer import Localizer
 from visloc.localization.solving import Look, SeenImage
 from visloc.options import LocalizeOptions
 from visloc.priors import Priors
+from visloc.timing import summed
 from visloc.types import InstantAnswer, QueryFeatures, Reason, Refusal, RigSensor
 
 _MAX_LISTED = 500  # characters of names from outside

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from service.values import PackedQuery, Query
@@ -61,12 +61,3 @@ def pack(decoded: DecodedQuery) -> PackedQuery:
     }
     parts = decoded.query, found, decoded.seconds
     return PackedQuery(pickle.dumps(parts, pickle.HIGHEST_PROTOCOL))
-
-
-def summed(*parts: Mapping[str, float]) -> dict[str, float]:
-    """Add up wall times by stage, in the order in which stages are named first."""
-    total: dict[str, float] = {}
-    for part in parts:
-        for stage, seconds in part.items():
-            total[stage] = total.get(stage, 0.0) + seconds
-    return total

@@ -37,7 +37,7 @@ from service.values import (
 from service.workers.instants import Target, check_images, check_options, check_priors, rig_in_map
 from service.workers.judging import gated, judged
 from service.workers.open_maps import OpenMaps
-from service.workers.photos import DecodedQuery, decode, pack, summed
+from service.workers.photos import DecodedQuery, decode, pack
 from service.workers.sequences import SequenceRun
 from visloc.drawing.matches_picture import draw_overlay
 from visloc.errors import InvalidInput, VislocError
@@ -49,6 +49,7 @@ from visloc.localization.solving import Look, SeenImage, Solved
 from visloc.localization.turning import is_worth_turning
 from visloc.options import LocalizeOptions
 from visloc.priors import Priors
+from visloc.timing import summed
 from visloc.types import InstantAnswer
 
 logger = logging.getLogger(__name__)

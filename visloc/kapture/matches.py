@@ -6,6 +6,7 @@ keypoint of each photo, and a score. A folder may have ``matches.tar`` instead.
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -54,11 +55,28 @@ class MatchFiles:
             DatasetError: with the file: ``kapture.match_values``, ``kapture.feature_size``,
                 ``kapture.feature_too_large``, ``kapture.unreadable``, ``kapture.path``.
         """
+        found = self._find(first, second)
+        if found is None:
+            return None
+        name, columns, content = found
+        return self._rows(name, content)[:, columns]
+
+    def digest(self, first: str, second: str) -> str:
+        """Return a hash of the file that ``read`` reads, without looking at its matches.
+
+        Raises:
+            DatasetError: as ``read``, but for the values and the size of the rows.
+        """
+        name, _, content = self._find(first, second) or ("", [], b"")
+        return hashlib.sha256(name.encode() + b"\0" + content).hexdigest()
+
+    def _find(self, first: str, second: str) -> tuple[str, list[int], bytes] | None:
+        """Return the name and content of a pair's file, and the columns of first and second."""
         for one, other, columns in ((first, second, [0, 1]), (second, first, [1, 0])):
             name = match_file(one, other)
             content = self._content(name)
             if content is not None:
-                return self._rows(name, content)[:, columns]
+                return name, columns, content
         return None
 
     def _rows(self, name: str, content: bytes) -> NDArray[np.int64]:

@@ -6,7 +6,9 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+from visloc.errors import refuse
 from visloc.kapture.table import Table
+from visloc.kapture.text import is_field
 from visloc.kapture.writer import write_atomically
 
 _HEADER = "# query_image, map_image, score"
@@ -46,7 +48,16 @@ def read_pair_rows(path: Path) -> Iterator[PairRow]:
 
 
 def write_pair_rows(path: Path, rows: Iterable[tuple[str, str, float]]) -> None:
-    """Write pairs as kapture has them, scores exactly; a file there is replaced."""
-    lines = [_HEADER, *(f"{first}, {second}, {score!r}" for first, second, score in rows)]
+    """Write pairs as kapture has them, scores exactly; a file there is replaced.
+
+    Raises:
+        DatasetError: ``kapture.field`` for a name with a comma, or that would not be read as it is.
+    """
+    lines = [_HEADER]
+    for first, second, score in rows:
+        for name in (first, second):
+            if not is_field(name):
+                raise refuse("kapture.field", field=str(path), got=name)
+        lines.append(f"{first}, {second}, {score!r}")
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, ("\n".join(lines) + "\n").encode("utf-8"))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,7 +22,7 @@ from visloc.pose.centre import position_covariance, with_origin
 from visloc.pose.generalized import GeneralizedPose
 from visloc.pose.views import MatchedView
 from visloc.priors import Priors
-from visloc.timing import timed
+from visloc.timing import summed, timed
 from visloc.types import (
     CameraSource,
     CoarsePose,
@@ -172,7 +172,7 @@ def solve_instant(
     constraints = Constraints(geometry, priors)
     looks = [image.look for image in images if image.look is not None]
     views = _views_of(images, [look.matches for look in looks], options)
-    seconds = _summed([look.evidence.seconds for look in looks])
+    seconds = summed(*(look.evidence.seconds for look in looks))
     scores = np.empty(0, np.float32)
     with timed(seconds, "pose"):
         problem, found, refusal = _find_pose(
@@ -436,12 +436,3 @@ def _with_turned_photos(refusal: Refusal, looks: Sequence[Look]) -> Refusal:
     exif = ", ".join(map(str, orientations))
     hint = f"stored rotated (EXIF orientation {exif}) and read as stored: try read_as=upright"
     return replace(refusal, message=f"{refusal.message}; the photo is {hint}")
-
-
-def _summed(parts: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """Seconds by stage of several images together."""
-    total: dict[str, float] = {}
-    for part in parts:
-        for stage, seconds in part.items():
-            total[stage] = total.get(stage, 0.0) + seconds
-    return total

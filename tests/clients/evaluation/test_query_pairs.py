@@ -83,3 +83,19 @@ def test_pairs_of_other_photos_are_refused(
     asked = ["--map", "room", "--server", http_url, "--pairs", pairs, "--output", tmp_path / "o"]
     assert run("batch", make_dataset({"a.jpg": HERE}), *asked) == 1
     assert "pairs.no_query" in capsys.readouterr().err
+
+
+def test_a_photo_with_pairs_that_cannot_be_asked_for_fails_alone(
+    http_url: str, make_dataset: Callable[..., Path], tmp_path: Path
+) -> None:
+    dataset = make_dataset({"a.jpg": HERE, "b.jpg": HERE})
+    pairs, output = tmp_path / "pairs.txt", tmp_path / "out"
+    too_many = "".join(f"a.jpg db/{number}.jpg\n" for number in range(1001))
+    pairs.write_text(f"{too_many}b.jpg db/1.jpg\n")
+    asked = ["--map", "room", "--server", http_url, "--pairs", pairs, "--output", output]
+
+    assert run("batch", dataset, *asked) == 0
+
+    lines = [json.loads(line) for line in (output / "results.jsonl").read_text().splitlines()]
+    assert [line["status"] for line in lines] == ["error", "localized"]
+    assert lines[0]["error"]["code"] == "options.photos"

@@ -257,6 +257,46 @@ def test_what_cannot_be_scored_is_refused(
     assert f"[{code}]" in capsys.readouterr().err
 
 
+def test_poses_without_a_finite_error_are_reported_as_wrong(tmp_path: Path) -> None:
+    truth = write(tmp_path / "truth.txt", {n: [1.0, 0, 0, 0, 0, 0, 0] for n in ("a.jpg", "b.jpg")})
+    far = write(tmp_path / "far.txt", {"a.jpg": [1.0, 0, 0, 0, 1e308, 1e308, 1e308]})
+    report = tmp_path / "report.json"
+    assert evaluate(far, "--truth", truth, "--report", report) == 0
+    scene = json.loads(report.read_bytes())["scenes"][0]
+    assert scene["position_error_m"] == {"p50": None, "p75": None, "p90": None, "max": None}
+    assert [each["fraction"] for each in scene["recall"]] == [0.0] * 4
+
+
+@pytest.mark.parametrize(("variance", "ratio"), [(0.0, None), (1e308, 0.0)])
+def test_covariances_of_any_size_are_reported(
+    tmp_path: Path, variance: float, ratio: float | None
+) -> None:
+    pose = {
+        "cam_from_world": {"rotation_wxyz": [1.0, 0, 0, 0], "translation": [1.0, 0, 0]},
+        "position": [-1.0, 0, 0],
+        "orientation": [1.0, 0, 0, 0],
+        "covariance": (variance * np.eye(6)).ravel().tolist(),
+        "position_std": [0.0, 0, 0],
+        "orientation_std_deg": [0.0, 0, 0],
+    }
+    line = {"name": "a.jpg", "status": "localized", "inliers": 30, "pose": pose}
+    results = tmp_path / "results.jsonl"
+    results.write_text(json.dumps(line) + "\n")
+    truth = write(tmp_path / "truth.txt", {"a.jpg": [1.0, 0, 0, 0, 0, 0, 0]})
+    report = tmp_path / "report.json"
+    assert evaluate(results, "--truth", truth, "--report", report) == 0
+    scene = json.loads(report.read_bytes())["scenes"][0]
+    assert scene["calibration"]["median_ratio"] == ratio
+
+
+def test_a_result_that_nests_too_deeply_is_named(tmp_path: Path) -> None:
+    results = tmp_path / "results.jsonl"
+    results.write_text("[" * 100_000 + "\n")
+    with pytest.raises(DatasetError) as caught:
+        read_poses(results)
+    assert caught.value.code == "results.line"
+
+
 def test_patterns_may_hold_an_equals_sign() -> None:
     assert read_conditions(["a=b=c*"], None).patterns == (("a", "b=c*"),)
     with pytest.raises(InvalidInput):

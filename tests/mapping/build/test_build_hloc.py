@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import shutil
 import tarfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -31,6 +34,7 @@ from visloc.localization.localizer import Localizer
 from visloc.matching.correspondences import mutual_nearest_neighbours
 from visloc.matching.products import round_descriptors
 from visloc.options import LocalizeOptions
+from visloc.pose.colmap import project
 from visloc.types import LocalFeatures, Localized, QueryFeatures
 
 h5py = pytest.importorskip("h5py", reason="h5py is not installed: the extra hloc")
@@ -189,6 +193,47 @@ def test_matches_need_the_keypoints_that_they_are_of(
     assert caught.value.code == "sfm.matches"
 
 
+def test_landmarks_of_matches_keep_their_keypoints_where_something_is_fixed_to_the_picture(
+    walk: Path, tmp_path: Path, build_walk: Build
+) -> None:
+    folder, made = tmp_path / "walk", tmp_path / "features"
+    shutil.copytree(walk / "mapping", folder)
+    dataset, extractor = read_dataset(folder), make_local_features("sift")
+    logo = (
+        np.random.default_rng(0).integers(0, 256, (10, 16, 3), np.uint8).repeat(5, 0).repeat(5, 1)
+    )
+    found = {}
+    for record in dataset.images:
+        picture = read_photo_file(dataset.path_of(record)).rgb.copy()
+        picture[:50, :80] = logo
+        cv2.imwrite(str(dataset.path_of(record)), picture[..., ::-1])
+        found[record.path] = local = extractor.extract(picture, max_keypoints=800)
+        write_local_features(
+            made, "mine", record.path, local.keypoints, local.descriptors, name="mine"
+        )
+    for first, second in combinations(sorted(found), 2):
+        looks = (round_descriptors(found[name].descriptors) for name in (first, second))
+        i, j, _ = mutual_nearest_neighbours(*looks)
+        write_matches(made / "matches", first, second, np.column_stack([i, j]))
+
+    opened = build_walk(
+        *(folder, tmp_path / "maps"),
+        local_features="kapture:mine",
+        features_dir=made,
+        sfm=_sfm(matches_dir=made / "matches"),
+    )
+
+    assert any("keeps its pixels" in note for note in opened.manifest.notes)
+    assert len(opened.landmarks) > 500
+    for row, image in enumerate(opened.images):
+        pose = Pose.from_quaternion(opened.image_poses[row][:4], opened.image_poses[row][4:])
+        seen = opened.landmarks[opened.observations(row)[0]] + opened.manifest.world.origin
+        pixels = project(opened.cameras[image.camera], pose.apply(seen))
+        keypoints = opened.keypoints(row)
+        assert np.linalg.norm(pixels - keypoints, axis=1).max() < 6
+        assert not ((keypoints < (80, 50)).all(axis=1)).any()
+
+
 def test_matches_are_found_in_either_order_and_in_a_tar(tmp_path: Path) -> None:
     rows = np.array([[5, 7], [2, 9]])
     write_matches(tmp_path / "loose", "z/b.jpg", "a c.jpg", rows)
@@ -244,6 +289,8 @@ BAD: list[tuple[dict[str, Any], dict[str, Any], str]] = [
     ({"keypoints": np.ones(3)}, {}, "hloc.group"),
     ({"keypoints": np.full((3, 2), np.nan)}, {}, "hloc.group"),
     ({"keypoints": np.array([[b"a", b"b"]] * 3)}, {}, "hloc.group"),
+    ({"keypoints": np.full((3, 2), 1e300)}, {}, "hloc.group"),
+    ({"keypoints": h5py.Empty("f4")}, {}, "hloc.group"),
     ({"descriptors": np.eye(4)}, {}, "hloc.group"),
     ({}, {"a.jpg/b-1.jpg/matches0": np.array([0, 1])}, "hloc.group"),
     ({}, {"a.jpg/b-1.jpg/matches0": np.array([0.0, 1, 2])}, "hloc.group"),

@@ -103,6 +103,7 @@ def write(name: str, text: str) -> Callable[[Path], None]:
         (append("dataset_test.txt", "a.png 1 2 3 0 0 0 0\n"), "archive.content", "a.png"),
         (append("dataset_test.txt", "a.png 1 2 3 1 0 0 x\n"), "archive.content", "a.png"),
         (append("dataset_test.txt", "a.png 1 2 3 1 0 0 0\n"), "archive.missing", ".nvm"),
+        (append("dataset_train.txt", f"{PHOTOS[0]} 1 2 3 1 0 0 0\n"), "archive.content", PHOTOS[0]),
     ],
 )
 def test_a_bad_archive_is_refused_with_the_file(

@@ -24,6 +24,7 @@ from mapping.stages.photos import MappingPhoto
 from mapping.stages.work_folder import WorkFolder
 from visloc.geometry import Camera, Pose
 from visloc.kapture import FileRecord
+from visloc.kapture.matches import open_matches, write_matches
 from visloc.options import Inference
 from visloc.pose.colmap import project
 from visloc.types import Fingerprint, LocalFeatures
@@ -164,6 +165,31 @@ def test_what_is_fixed_to_the_picture_has_no_verified_matches(tmp_path: Path) ->
         looks = outside.features.read(photos[pair.first]).descriptors[pair.rows[:, 0]]
         assert len(looks) >= 28
         assert (looks.argmax(axis=1) >= 30).mean() > 0.8  # the others are points of the place
+    assert key != match_pairs(context, photos, pairs, plain)[1]
+
+
+def test_given_matches_of_what_is_fixed_to_the_picture_are_left_out(tmp_path: Path) -> None:
+    photos = [make_photo(number) for number in range(4)]
+    pairs = np.array([[a, b] for a in range(4) for b in range(a + 1, 4)])
+    rows = np.column_stack([np.arange(60), np.arange(60)])
+    for a, b in pairs.tolist():
+        write_matches(tmp_path / "given", photos[a].name, photos[b].name, rows)
+    context = BuildContext(
+        WorkFolder(tmp_path / "work"),
+        FeaturesOnALogo(),
+        Networks(None, Inference.TORCH),
+        Workers(1),
+        lambda *_: None,
+        open_matches(tmp_path / "given"),
+    )
+    plain = Verification(4.0, 15, poses_known=False)
+    fixed = find_fixed(context, photos, pairs, plain)
+    assert fixed.keys() == {"cam"}
+    outside = outside_fixed(context, photos, fixed)
+    assert outside.features is context.features  # whose rows the matches name
+    found, key = match_pairs(outside, photos, pairs, plain)
+    assert len(found) == 6
+    assert all((pair.rows >= 30).mean() > 0.8 for pair in found)
     assert key != match_pairs(context, photos, pairs, plain)[1]
 
 

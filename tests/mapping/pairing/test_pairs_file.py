@@ -35,6 +35,14 @@ def test_pairs_come_back_as_written(scene: Scene, tmp_path: Path) -> None:
     assert [file.name for file in path.parent.iterdir()] == ["pairs.txt"]
 
 
+def test_a_name_with_a_comma_is_not_written(make_scene: Make, path: Path) -> None:
+    scene = make_scene(names=["a,b.jpg", "c.jpg"])
+    with pytest.raises(DatasetError) as caught:
+        write_pairs(path, scene, Pairs(np.array([[0, 1]]), np.array([0.5])))
+    assert caught.value.code == "kapture.field"
+    assert not path.exists()
+
+
 def test_files_are_written_as_kapture_does(scene: Scene, path: Path) -> None:
     write_pairs(path, scene, Pairs(np.array([[0, 2]]), np.array([0.5])))
 

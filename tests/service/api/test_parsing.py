@@ -105,6 +105,24 @@ def test_more_than_there_is_room_for_is_refused_until_there_is_again() -> None:
     asyncio.run(play())
 
 
+def test_it_goes_on_after_a_panic_of_a_parser() -> None:
+    class Panic(BaseException):
+        """Like pyo3's PanicException, it is no Exception."""
+
+    queue = OneByOne()
+
+    def panic() -> None:
+        raise Panic
+
+    async def play() -> None:
+        async with asyncio.timeout(10):
+            with pytest.raises(Panic):
+                await queue.run(panic, 1)
+            assert await queue.run(lambda: "parsed", 1) == "parsed"
+
+    asyncio.run(play())
+
+
 def test_nothing_of_a_refused_message_stays() -> None:
     queue, messages = OneByOne(), list["weakref.ref[Message]"]()
 
