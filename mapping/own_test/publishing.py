@@ -14,6 +14,8 @@ from visloc.archive.checks import read_manifest
 from visloc.archive.schema import Doubt
 from visloc.errors import NotFound, refuse
 
+# Kinds of doubts that no test of the finished map finds again.
+_OF_THE_BUILD = ("left_out", "matches", "order", "scale")
 Examine = Callable[[Map], Sequence[Doubt]]
 """What else speaks against a map, beside its own test."""
 
@@ -26,12 +28,17 @@ def publish_edited(
     photos: Sequence[Path] = (),
     based_on: str | None = None,
     accept: bool = False,
+    carried: Sequence[Doubt] = (),
 ) -> Path:
-    """Publish content made from maps as a version of a map, as ``publish_content``.
+    """Test content made from maps, and publish it as a version of a map.
+
+    A version that its own test speaks against is published, but not made current.
 
     Args:
         photos: small copies of all photos, in their order; or none.
         based_on: the version that the content was made from, if it is one of the same map.
+        accept: make it current all the same.
+        carried: doubts about the map that the content was made from.
 
     Returns:
         The folder of the new version.
@@ -43,30 +50,8 @@ def publish_edited(
         raise AssertionError(f"{len(photos)} pictures of {len(content.images)} photos")
     with store.incoming() as incoming:
         link_photos(incoming, photos)
-        return publish_content(store, incoming, content, map_id, based_on=based_on, accept=accept)
-
-
-def publish_content(
-    store: MapStore,
-    incoming: Path,
-    content: MapContent,
-    map_id: str,
-    *,
-    based_on: str | None = None,
-    accept: bool = False,
-) -> Path:
-    """Write content beside the files that a folder has already, test it, and publish it.
-
-    A version that its own test speaks against is published, but not made current.
-
-    Args:
-        accept: make it current all the same.
-
-    Raises:
-        Conflict: ``map.outdated``.
-    """
-    version = write_content(incoming, content, map_id)
-    return publish_tested(store, incoming, map_id, version, based_on=based_on, accept=accept)
+        version = write_content(incoming, content, map_id, carried=carried)
+        return publish_tested(store, incoming, map_id, version, based_on=based_on, accept=accept)
 
 
 def publish_tested(
@@ -78,8 +63,15 @@ def publish_tested(
     based_on: str | None = None,
     accept: bool = False,
 ) -> Path:
-    """Publish what ``write_content`` wrote; make it current unless there are doubts."""
-    is_doubtful = bool(read_manifest(incoming).parts.doubts)
+    """Publish what ``write_content`` wrote; make it current unless there are doubts.
+
+    Doubts of the version that it is based on do not count: somebody put that into use.
+    """
+    doubts, known = read_manifest(incoming).parts.doubts, tuple[Doubt, ...]()
+    if based_on is not None:
+        with suppress(NotFound):  # store.publish tells
+            known = store.open(f"{map_id}@{based_on}").manifest.parts.doubts
+    is_doubtful = any(doubt not in known for doubt in doubts)
     return store.publish(
         incoming, map_id, version, based_on=based_on, make_current=accept or not is_doubtful
     )
@@ -109,6 +101,7 @@ def write_content(
     map_id: str,
     left_out: Sequence[str] = (),
     examine: Examine | None = None,
+    carried: Sequence[Doubt] = (),
 ) -> str:
     """Write content beside the files that a folder has already, test it, and return its version.
 
@@ -117,10 +110,16 @@ def write_content(
     Args:
         left_out: photos that found no place, as for ``doubts_about``.
         examine: finds more doubts.
+        carried: doubts about the map that the content was made from. Those that only its build
+            could find are kept.
     """
     version, created = new_version()
     write_map(folder, content, map_id=map_id, version=version, created=created)
     opened = open_map(folder)
     run = run_own_test(opened)
-    doubts = (*doubts_about(opened, run, left_out), *(examine(opened) if examine else ()))
+    doubts = (
+        *doubts_about(opened, run, left_out),
+        *(examine(opened) if examine else ()),
+        *(doubt for doubt in carried if doubt.kind in _OF_THE_BUILD),
+    )
     return add_own_test(folder, run.test, version=version, doubts=doubts)

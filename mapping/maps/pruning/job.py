@@ -76,7 +76,8 @@ def prune_map(
                 if pictures
                 else [],
             )
-            version = write_content(incoming, content, map_id)
+            doubts = before.manifest.parts.doubts
+            version = write_content(incoming, content, map_id, carried=doubts)
             # Measured before anybody is served it.
             after = open_map(incoming)
             told = partial(progress, "before and after")

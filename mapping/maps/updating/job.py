@@ -155,6 +155,7 @@ def update_map(settings: UpdateSettings, progress: Progress) -> Updated:
                     photos=pictures,
                     based_on=version,
                     accept=settings.accept,
+                    carried=opened.manifest.parts.doubts,
                 )
             shutil.rmtree(work.root, ignore_errors=True)
     except OSError as error:

@@ -16,7 +16,8 @@ from mapping.maps.pruning.accuracy import BINS, Accuracy, lost
 from mapping.maps.pruning.choosing import least, num_landmarks
 from mapping.own_test.publishing import publish_edited
 from mapping.own_test.trials import own_test
-from visloc.archive import Map, MapStore
+from visloc.archive import Map, MapStore, add_own_test
+from visloc.archive.schema import Doubt
 from visloc.errors import Conflict, InvalidInput, VislocError
 
 
@@ -47,6 +48,23 @@ def test_a_pruned_map_is_tested_anew(pruned: Pruned) -> None:
     assert learned == own_test(pruned.after)
     assert learned != pruned.before.manifest.parts.own_test
     assert learned.localized > 0
+
+
+def test_doubts_that_only_a_build_finds_stay_with_what_is_made_of_the_map(store: MapStore) -> None:
+    before = store.open("room")
+    test = before.manifest.parts.own_test
+    assert test is not None
+    found = [Doubt(kind="matches", message="bent"), Doubt(kind="own_test", message="tested anew")]
+    with store.incoming() as incoming:
+        shutil.copytree(before.path, incoming, dirs_exist_ok=True)
+        version = add_own_test(incoming, test, version="20300101T000000.000Z-1", doubts=found)
+        store.publish(incoming, "room", version)  # as with --accept
+    doubted = store.open("room")
+
+    after = prune_map(store, "room", max_bytes=doubted.size_bytes * 7 // 10, progress=quiet).after
+
+    assert [doubt.kind for doubt in after.manifest.parts.doubts] == ["matches"]
+    assert store.current_version("room") == after.manifest.version  # as the one before
 
 
 def keep_all(opened: Map) -> Kept:
