@@ -126,7 +126,8 @@ def _draw_mapping_photo(axes: Axes, opened: Map, row: int) -> None:
     """Draw a photo that the map keeps, or else the keypoints of its landmarks."""
     preview, camera = read_preview(opened, row), opened.cameras[opened.images[row].camera]
     if preview is None:
-        axes.scatter(*opened.keypoints(row).T, s=0.5, color=_MAPPING, linewidths=0)
+        x, y = opened.keypoints(row).T
+        axes.scatter(x, y, s=0.5, color=_MAPPING, linewidths=0)
         axes.set_aspect("equal")
         axes.set_xlim(0, camera.width)
         axes.set_ylim(camera.height, 0)
