@@ -245,18 +245,6 @@ def test_shell_examples_run(line: str, desk: Desk) -> None:
         assert json.loads(printed)["status"] == "localized"
 
 
-def test_the_example_without_a_server_localizes_a_photo(built_maps: Path, desk: Desk) -> None:
-    example = ROOT / "examples" / "localize_in_process.py"
-
-    printed = desk.run(
-        sys.executable, str(example), str(built_maps), "room", ".demo/photo.jpg", desk.camera_text
-    )
-
-    found = re.fullmatch(r"at (\S+) (\S+) (\S+), \d+ inliers\n", printed)
-    assert found is not None, printed
-    np.testing.assert_allclose([float(x) for x in found.groups()], desk.center, atol=0.05)
-
-
 JSON_EXAMPLES = [json.loads(text) for page in PAGES for text in blocks(page, "json")]
 
 

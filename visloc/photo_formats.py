@@ -40,6 +40,13 @@ from visloc.file_kinds import HEAD_BYTES, file_kind
 from visloc.heic import decode_heic, heic_outline
 
 FORMATS = "JPEG, HEIC, PNG, WebP, AVIF, TIFF or BMP"
+# How the names of photos end, in lower case.
+SUFFIXES = frozenset(
+    {
+        *(".avif", ".bmp", ".heic", ".heif", ".hif", ".jpeg", ".jpg", ".png", ".tif", ".tiff"),
+        ".webp",
+    }
+)
 _READERS: Mapping[str, Callable[[io.BytesIO], ImageFile]] = {
     "JPEG": JpegImageFile,
     "PNG": PngImageFile,

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from clients.evaluation.accuracy import Compared, accuracy_of, finite
 from clients.evaluation.filling import estimate_of, measured
 from clients.evaluation.modes import Mode
 from clients.evaluation.queries import Query
 from clients.evaluation.run import InstantOutcome, Outcome
 from clients.wire.answers import ServerInfo
+from visloc.accuracy import Compared, accuracy_of, finite
 from visloc.errors import InvalidInput, refuse
 from visloc.evaluation import Threshold, percentile
 from visloc.sequences.filling import TracedPose

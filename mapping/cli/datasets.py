@@ -121,7 +121,7 @@ def export_features_command(
 def dataset(
     name: Annotated[str, typer.Argument(metavar="SET", help=f"One of {', '.join(READERS)}.")],
     folder: Annotated[
-        Path, typer.Argument(metavar="FOLDER", help="The unpacked archive of one scene.")
+        Path, typer.Argument(metavar="FOLDER", help="The unpacked archive, of one scene.")
     ],
     output: Annotated[
         Path, typer.Option("--output", help="Folder to make, with mapping/ and query/.")

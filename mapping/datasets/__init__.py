@@ -6,7 +6,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
+from mapping.datasets.aachen import read_aachen, read_aachen_v1_1
 from mapping.datasets.cambridge import read_cambridge
+from mapping.datasets.cmu import read_cmu
+from mapping.datasets.robotcar import read_robotcar
 from mapping.datasets.seven_scenes import read_seven_scenes
 from mapping.stages.outputs import complete_output
 from visloc.errors import refuse
@@ -18,6 +21,10 @@ Reader = Callable[[Path], Mapping[str, Dataset]]
 READERS: Mapping[str, Reader] = {
     "7scenes": read_seven_scenes,
     "cambridge": read_cambridge,
+    "aachen": read_aachen,
+    "aachen-v1.1": read_aachen_v1_1,
+    "robotcar": read_robotcar,
+    "cmu": read_cmu,
 }
 
 
@@ -47,6 +54,6 @@ def write_parts(name: str, folder: Path, output: Path) -> Mapping[str, Dataset]:
         for part, dataset in parts.items():
             sensors = partial / part / "sensors"
             sensors.mkdir(parents=True)
-            (sensors / "records_data").symlink_to(folder.resolve())
+            (sensors / "records_data").symlink_to(dataset.root.resolve())
             write_dataset(replace(dataset, root=partial / part))
     return parts

@@ -23,18 +23,14 @@ from visloc.images import FILE_LIMITS, read_exif, read_photo
 from visloc.kapture import GnssRecord, Sensor
 from visloc.kapture.dataset import UNKNOWN_CAMERA
 from visloc.kapture.text import has_control_characters
-from visloc.photo_formats import FORMATS
+from visloc.photo_formats import FORMATS, SUFFIXES
 
-_SUFFIXES = {
-    *(".avif", ".bmp", ".heic", ".heif", ".hif", ".jpeg", ".jpg", ".png", ".tif", ".tiff"),
-    ".webp",
-}
 _GNSS = "gnss"
 # Beside what begins with a dot: what Windows, macOS and network storage put among photos.
 _SYSTEM_NAMES = {"thumbs.db", "desktop.ini", "@eadir", "__macosx", "$recycle.bin"}
 _SYSTEM = "hidden, or of the operating system"
 _LINKED = "links out of the folder and linked folders are not followed"
-_RENAME = f"photos whose names do not end in {', '.join(sorted(_SUFFIXES))}: rename them"
+_RENAME = f"photos whose names do not end in {', '.join(sorted(SUFFIXES))}: rename them"
 # What Pillow raises on malformed EXIF beside giving none; found by fuzzing ``visloc.images``.
 _MALFORMED = (
     *(OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, AttributeError),
@@ -231,7 +227,7 @@ def _why_not_read(path: Path, inside: Path) -> str | None:
         return _LINKED
     if path.exists() and not path.is_file():  # reading from a pipe would wait for ever
         return "neither files nor folders"
-    if path.suffix.lower() in _SUFFIXES:
+    if path.suffix.lower() in SUFFIXES:
         return None
     kind = _kind_of(path)
     if kind is None:

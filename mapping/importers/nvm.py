@@ -98,6 +98,26 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
     return _model(path, photos, parts[largest], fixed, notes)
 
 
+def read_poses(path: Path) -> dict[str, Pose]:
+    """Read ``cam_from_world`` by name from the first model of a file; its points are not read.
+
+    Raises:
+        DatasetError: ``import.unreadable``, ``import.truncated``, ``import.line``; ``import.empty``
+            without a camera; ``import.duplicate_image``.
+    """
+    found: dict[str, Pose] = {}
+    with TextLines(path) as lines:
+        _, has_matrices = _read_header(lines)
+        for _ in range(lines.to_integer(lines.next("the number of cameras"), _MAX_COUNT)):
+            camera = _read_camera(lines, has_matrices)
+            if camera.name in found:
+                raise refuse("import.duplicate_image", field=f"{path}:{camera.line}")
+            found[camera.name] = camera.pose
+    if not found:
+        raise refuse("import.empty", "the file holds no model", field=str(path))
+    return found
+
+
 def _nvm_file(path: Path) -> Path:
     if not path.is_dir():
         return path

@@ -186,7 +186,7 @@ def _shown(opened: Map, look: Look, query: _Panel) -> Iterator[_Shown]:
             color=_LINES[rank % len(_LINES)],
             left=left,
             panel=_fit(camera.width, camera.height, corner, (_CELL_WIDTH, _CELL_HEIGHT)),
-            preview=_preview(opened, row),
+            preview=read_preview(opened, row),
             keypoints=keypoints,
             rgb=None if opened.colors is None else opened.colors[observed],
             matches=matches,
@@ -194,7 +194,12 @@ def _shown(opened: Map, look: Look, query: _Panel) -> Iterator[_Shown]:
         )
 
 
-def _preview(opened: Map, row: int) -> NDArray[np.uint8] | None:
+def read_preview(opened: Map, row: int) -> NDArray[np.uint8] | None:
+    """Decode the small photo (H, W, 3) that a map keeps of a row; None when it keeps none.
+
+    Raises:
+        MapCorrupt: ``map.photo``.
+    """
     data = opened.photo(row)
     if data is None:
         return None
