@@ -59,7 +59,7 @@ def capture(
     picture.parent.mkdir(parents=True, exist_ok=True)
     draw_walk(opened, trials, picture)
     store = MapStore(settings.maps_dir)
-    pieces = [store.open(ref) for ref in pieces_of(opened)]
+    pieces = [store.open(ref) for ref in pieces_of(opened.manifest)]
     print_map(opened)
     print_pieces(store, opened)
     print_costs(OUT, costs.table())
