@@ -41,7 +41,14 @@ from mapping.importers.dataset import write_imported
 from mapping.importers.images import read as read_photos
 from mapping.methods.extending import with_late_photos
 from mapping.methods.look_alikes import without_look_alikes
-from mapping.methods.matching import Matches, Verification, find_fixed, match_pairs, outside_fixed
+from mapping.methods.matching import (
+    Matches,
+    Verification,
+    find_fixed,
+    match_pairs,
+    matches_among,
+    outside_fixed,
+)
 from mapping.methods.pieces import models_beside
 from mapping.methods.scenes import find_pairs, make_scene
 from mapping.methods.sfm_settings import SfmSettings
@@ -164,7 +171,16 @@ def all_models(root: Path, work: Path) -> tuple[int, list[Model]]:
         return len(scene.photos), []
     largest = _with_late(scene, largest)
     believed = without_look_alikes(scene.photos, scene.matches)
-    models = [largest, *models_beside(largest, believed, make)]
+
+    def make_late(rows: Sequence[int], matches: Sequence[Matches]) -> SparseModel:
+        part = Matched(
+            [scene.photos[row] for row in rows],
+            [scene.looks[row] for row in rows],
+            matches_among(rows, scene.matches),
+        )
+        return _with_late(part, make(rows, matches))
+
+    models = [largest, *models_beside(largest, believed, make_late)]
     return len(scene.photos), [_poses(scene, model) for model in models]
 
 

@@ -66,7 +66,7 @@ class PhotoResult:
     truth: Pose | None = None
 
     @property
-    def status(self) -> Literal["localized", "not_localized", "error"]:
+    def status(self) -> Literal["localized", "coarse", "not_localized", "error"]:
         """What came of it."""
         return "error" if self.answer is None else self.answer.status
 

@@ -111,7 +111,7 @@ def make_missing(places: Places, needed: set[str], tell: Callable[[str], None]) 
         refs = [
             ref
             for map_id in (*FLOOR_11, *VIDEOS)
-            for ref in (map_id, *pieces_of(places.store.open(map_id)))
+            for ref in (map_id, *pieces_of(places.store.open(map_id).manifest))
         ]
         tiles = [
             (ref, Similarity(1.0, np.eye(3), np.array([APART * i, 0.0, 0.0])))

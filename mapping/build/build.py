@@ -255,11 +255,11 @@ class _Job:
                 made = replace(
                     made, notes=(*made.notes, note_of_piece(map_id, self.settings.map_id))
                 )
-            elif written:
+            elif self.settings.sfm.estimate_poses:
                 refs: list[JsonValue] = [each.ref for each in written]
                 made = replace(
                     made,
-                    notes=(*made.notes, note_of_largest(written)),
+                    notes=(*made.notes, *([note_of_largest(written)] if written else [])),
                     settings={**made.settings, PIECES: refs},
                 )
             folder = incoming / map_id

@@ -7,19 +7,22 @@ passed over. The pieces have no common frame.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import count, islice
 from pathlib import Path
 
+from pydantic import JsonValue
+
 from mapping.own_test.publishing import publish_tested
-from visloc.archive import Map, MapStore
+from visloc.archive import MapStore
 from visloc.archive.checks import read_manifest
-from visloc.archive.schema import ID_PATTERN
+from visloc.archive.schema import ID_PATTERN, Manifest
 from visloc.errors import MapCorrupt, NotFound, refuse
 
-# In the settings of the largest piece, for the manifest.
+# In the settings of the largest piece, for the manifest; there also if it is the only one. Updates
+# and merges drop it: nothing tells which versions of the pieces belong to what they make.
 PIECES = "pieces"
 # As many digits fit behind the id.
 _LONGEST_SUFFIX = "-999"
@@ -81,10 +84,47 @@ def note_of_largest(pieces: Sequence[WrittenMap]) -> str:
     )
 
 
-def pieces_of(opened: Map) -> list[str]:
+def pieces_of(manifest: Manifest) -> list[str]:
     """Return ``id@version`` of the other pieces of the build that made a map, largest first."""
-    pieces = opened.manifest.method.settings.get(PIECES, [])
+    pieces = manifest.method.settings.get(PIECES, [])
     return [str(ref) for ref in pieces] if isinstance(pieces, list) else []
+
+
+def without_pieces(settings: Mapping[str, JsonValue]) -> dict[str, JsonValue]:
+    """Return the settings of a method for a map that is not, or no more, as a build made it."""
+    return {name: value for name, value in settings.items() if name != PIECES}
+
+
+def use_version(store: MapStore, map_id: str, version: str) -> list[str]:
+    """Put a version into use; of a build that falls apart into pieces, these as well.
+
+    As when a build is published, a piece that its own test speaks against is not put into use, and
+    pieces of other builds are taken out of use.
+
+    Returns:
+        ``id@version`` of all that are in use now, the given one first.
+
+    Raises:
+        NotFound: ``map.unknown`` or ``map.version``; and as ``MapStore.set_current``.
+    """
+    manifest = store.outline(f"{map_id}@{version}").manifest
+    used: list[str] = []
+    if isinstance(manifest, Manifest) and PIECES in manifest.method.settings:
+        stale = set(_known_pieces(store, map_id))
+        for ref in pieces_of(manifest):
+            piece_id, _, piece_version = ref.partition("@")
+            if not _is_piece(store, piece_id, map_id):
+                continue  # removed, or of another map
+            with suppress(MapCorrupt, NotFound):
+                piece = store.outline(ref).manifest
+                if isinstance(piece, Manifest) and not piece.parts.doubts:
+                    store.set_current(piece_id, piece_version)
+                    stale.discard(piece_id)
+                    used.append(ref)
+        for piece_id in sorted(stale):
+            store.withdraw(piece_id)
+    store.set_current(map_id, version)
+    return [f"{map_id}@{version}", *used]
 
 
 def publish_pieces(store: MapStore, pieces: Sequence[WrittenMap], *, accept: bool) -> Path:

@@ -116,36 +116,45 @@ def out_of_order(opened: Map, films: Mapping[str, FilmedVideo]) -> list[str]:
 
 
 def _pieces(opened: Map, frames: Sequence[tuple[int, float]]) -> list[list[int]]:
-    """Cut frames (row, path) where the path jumps; a piece goes on where it fits again."""
+    """Cut frames (row, path) where the path jumps; a piece goes on where it fits again.
+
+    A frame that shares landmarks with the last one of a piece belongs to it, whatever the poses of
+    another piece allow. Else one frame that seems to lie away, as a fast turn escaped the corners'
+    tracking, would take along all frames after it.
+    """
     pieces: list[list[tuple[int, float]]] = []
-    for frame in frames:
+    for row, path in frames:
         # That of the frame before is tried first.
         pieces.sort(key=lambda piece: -piece[-1][1])
-        for piece in pieces:
-            (before, start), (row, end) = piece[-1], frame
-            if end - start <= _FAR and not _jumps(opened, before, row, end - start):
-                piece.append(frame)
-                break
-        else:
-            if pieces and frame[1] - pieces[0][-1][1] > _FAR:
-                pieces[0].append(frame)  # nothing was seen between them that contradicts
-            else:
-                pieces.append([frame])
+        shared = [piece for piece in pieces if _share_landmarks(opened, piece[-1][0], row)]
+        fitting = shared or [
+            piece
+            for piece in pieces
+            if path - piece[-1][1] <= _FAR
+            and not _jumps(opened, piece[-1][0], row, path - piece[-1][1])
+        ]
+        if not fitting and pieces and path - pieces[0][-1][1] > _FAR:
+            fitting = pieces  # nothing was seen between them that contradicts
+        if not fitting:
+            pieces.append([])
+            fitting = pieces[-1:]
+        fitting[0].append((row, path))
     return [[row for row, _ in piece] for piece in pieces]
 
 
-def _jumps(opened: Map, first: int, second: int, seen: float) -> bool:
-    """Whether two poses move the picture by much more than was seen, in its longer sides.
+def _share_landmarks(opened: Map, first: int, second: int) -> bool:
+    seen = np.intersect1d(_landmarks_of(opened, first), _landmarks_of(opened, second))
+    return len(seen) >= LINKING_LANDMARKS
 
-    Frames that share landmarks confirm each other: a fast turn can escape the corners' tracking.
-    """
-    offsets, observed = opened.observation_offsets, opened.observation_landmarks
-    landmarks, others = (
-        np.asarray(observed[offsets[row] : offsets[row + 1]]).astype(np.int64)
-        for row in (first, second)
-    )
-    if len(np.intersect1d(landmarks, others)) >= LINKING_LANDMARKS:
-        return False
+
+def _landmarks_of(opened: Map, row: int) -> NDArray[np.int64]:
+    start, end = opened.observation_offsets[row : row + 2]
+    return np.asarray(opened.observation_landmarks[start:end]).astype(np.int64)
+
+
+def _jumps(opened: Map, first: int, second: int, seen: float) -> bool:
+    """Whether two poses move the picture by much more than was seen, in its longer sides."""
+    landmarks = _landmarks_of(opened, first)
     landmarks = landmarks[:: max(1, len(landmarks) // _MOST_POINTS)]
     points = opened.landmarks[landmarks].astype(np.float64) + opened.manifest.world.origin
     pixels = []

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from mapping.build.pieces import use_version
 from mapping.cli.display import say
 from mapping.cluster.storage import open_store
 from mapping.options import CacheDirOption, PlacedMapsDirOption
@@ -22,12 +23,16 @@ def use(
     maps_dir: PlacedMapsDirOption = Path("maps"),
     cache_dir: CacheDirOption = Path("maps-cache"),
 ) -> None:
-    """Put a published version of a map into use, also one that its own test speaks against."""
+    """Put a published version of a map into use, also one that its own test speaks against.
+
+    With a version that a build made, the pieces of that build are put into use, and pieces of other
+    builds are taken out of use.
+    """
     map_id, _, version = map_ref.partition("@")
     if not version:
         raise refuse("map.use", field="MAP@VERSION", got=map_ref)
-    open_store(maps_dir, cache_dir).set_current(map_id, version)
-    say(f"in use: {map_ref}")
+    for ref in use_version(open_store(maps_dir, cache_dir), map_id, version):
+        say(f"in use: {ref}")
 
 
 def require_acceptance(opened: Map, *, accept: bool, pictures: Path) -> None:

@@ -59,7 +59,7 @@ def capture(
     picture.parent.mkdir(parents=True, exist_ok=True)
     draw_walk(opened, trials, picture)
     store = MapStore(settings.maps_dir)
-    pieces = [store.open(ref) for ref in pieces_of(opened)]
+    pieces = [store.open(ref) for ref in pieces_of(opened.manifest)]
     print_map(opened)
     print_pieces(store, opened)
     print_costs(OUT, costs.table())
@@ -74,11 +74,22 @@ def capture(
 
 
 def _announce(outlook: Outlook) -> None:
+    minutes = max(1, round(outlook.minutes))
     say(
-        f"{outlook.photos} photos to match: about {max(1, round(outlook.minutes))} minutes, "
-        f"{outlook.memory_bytes / 2**30:.1f} GiB of memory, {outlook.disk_bytes / 2**30:.1f} GiB "
-        f"of disk for the time being ({outlook.free_bytes / 2**30:.0f} GiB are free)"
+        f"{outlook.photos} photos to match: about {minutes} minute{'s' * (minutes > 1)}, "
+        f"{_size(outlook.memory_bytes)} of memory, {_size(outlook.disk_bytes)} of disk for the "
+        f"time being ({_size(outlook.free_bytes)} are free)"
     )
+    if outlook.disk_bytes > outlook.free_bytes:
+        say(
+            "the disk will probably be full before the map is made: make room, or choose a folder "
+            "on another disk (--maps-dir)"
+        )
+
+
+def _size(num_bytes: int) -> str:
+    gib = num_bytes / 2**30
+    return f"{gib:.1f} GiB" if gib >= 1 else f"{num_bytes / 2**20:.0f} MiB"
 
 
 def _print_account(captured: Captured, opened: Map, trials: Trials, pieces: Sequence[Map]) -> None:

@@ -127,7 +127,7 @@ def print_map(opened: Map) -> None:
 
 def print_pieces(store: MapStore, largest: Map) -> None:
     """Print the maps that the same build made of photos that nothing links to the largest map."""
-    for ref in pieces_of(largest):
+    for ref in pieces_of(largest.manifest):
         print_map(store.open(ref))
         map_id, _, version = ref.partition("@")
         if map_id not in store.ids() or store.current_version(map_id) != version:

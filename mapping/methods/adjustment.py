@@ -17,14 +17,20 @@ from mapping.methods.colmap_calls import interruptible, quiet
 from mapping.methods.colmap_scene import ColmapScene
 from mapping.methods.intrinsics import STEP
 from mapping.methods.sparse_model import SfmPhoto
+from mapping.progress import ItemProgress, not_told, part_of
 from visloc.pose.colmap import pose_from_colmap
 
 REFINABLE = ("poses", "points", "intrinsics")
 # Fewer photos of a camera do not tell its principal point; in lenses it lies nearer to the middle
 # than this share of the longer side.
 _MANY_PHOTOS, _MAX_SHIFT = 30, 0.02
-# Scale of the robust loss.
-_LOSS_SCALE_PX = 1.0
+# Scale of the robust loss. Where errors change by a smaller share in a step, camera centres move by
+# less than a thousandth of what is known of them, however many steps follow.
+_LOSS_SCALE_PX, _LEAST_CHANGE = 1.0, 1e-6
+# Most steps of an adjustment, and those between two reports of progress.
+_MOST_STEPS, _STEPS = 100, 5
+# A step that went as foreseen lets the next one go further by this factor (Ceres).
+_FURTHER = 3.0
 
 
 def refine_model(
@@ -33,15 +39,18 @@ def refine_model(
     scene: ColmapScene,
     refine: Sequence[str],
     held: Collection[str],
+    progress: ItemProgress,
 ) -> None:
     """Adjust points, and also the poses and intrinsics that ``refine`` names.
 
     Refined poses are aligned to the given ones again. Intrinsics of the sensors ``held`` stay.
+    ``progress`` is in steps.
     """
     poses = "poses" in refine
     options = _robust_options(poses=poses, intrinsics="intrinsics" in refine)
     with quiet():
-        _adjust(model, options, {scene.camera_ids[sensor] for sensor in held}, poses=poses)
+        constant = {scene.camera_ids[sensor] for sensor in held}
+        _adjust(model, options, constant, progress, poses=poses)
         if poses:
             given = [photo.cam_from_world for photo in photos if photo.cam_from_world is not None]
             moved = [
@@ -57,7 +66,11 @@ def refine_model(
 
 
 def error_rises(
-    model: pycolmap.Reconstruction, camera_ids: Collection[int], *, poses: bool
+    model: pycolmap.Reconstruction,
+    camera_ids: Collection[int],
+    progress: ItemProgress,
+    *,
+    poses: bool,
 ) -> dict[int, float]:
     """Return by camera how reprojection errors rise as focal lengths change and all else adapts.
 
@@ -70,14 +83,15 @@ def error_rises(
     before, after = pycolmap.Reconstruction(model), pycolmap.Reconstruction(model)
     others = set(model.cameras) - set(camera_ids)
     with quiet():
-        for copy, step in ((before, 0.0), (after, STEP)):
+        for number, (copy, step) in enumerate(((before, 0.0), (after, STEP))):
             for camera_id in camera_ids:
                 camera = copy.camera(camera_id)
                 for index in camera.focal_length_idxs():
                     camera.params[index] *= 1 + step
             options = _options(poses=poses, intrinsics=True)
             options.refine_focal_length = False
-            _adjust(copy, options, others, poses=poses)
+            _adjust(copy, options, others, part_of(progress, number, 2), poses=poses)
+    progress(2 * _MOST_STEPS, 2 * _MOST_STEPS)
     errors = _squared_errors(before), _squared_errors(after)
     return {
         camera_id: math.sqrt(max(errors[1].get(camera_id, 0.0) - errors[0].get(camera_id, 0.0), 0))
@@ -86,7 +100,7 @@ def error_rises(
 
 
 def adjusted_robustly(
-    model: pycolmap.Reconstruction, camera_ids: Collection[int]
+    model: pycolmap.Reconstruction, camera_ids: Collection[int], progress: ItemProgress
 ) -> pycolmap.Reconstruction:
     """Return a model adjusted once more, with a loss that wrong matches hardly move.
 
@@ -101,13 +115,16 @@ def adjusted_robustly(
 
     Args:
         camera_ids: of the cameras whose intrinsics may change.
+        progress: in steps of both adjustments.
     """
     adjusted = pycolmap.Reconstruction(model)
     options = _robust_options(poses=True, intrinsics=True)
     constant = set(model.cameras) - set(camera_ids)
     with quiet():
-        _adjust(adjusted, options, constant, poses=True)
-    return _with_principal_points(adjusted, camera_ids)
+        _adjust(adjusted, options, constant, part_of(progress, 0, 2), poses=True)
+    adjusted = _with_principal_points(adjusted, camera_ids, part_of(progress, 1, 2))
+    progress(2 * _MOST_STEPS, 2 * _MOST_STEPS)
+    return adjusted
 
 
 def adjust_some(model: pycolmap.Reconstruction, image_ids: Collection[int]) -> None:
@@ -120,11 +137,11 @@ def adjust_some(model: pycolmap.Reconstruction, image_ids: Collection[int]) -> N
             if not config.has_variable_point(seen.point3D_id):
                 config.add_variable_point(seen.point3D_id)
     with quiet():
-        _solve(model, _robust_options(poses=True, intrinsics=False), config)
+        _solve(model, _robust_options(poses=True, intrinsics=False), config, not_told)
 
 
 def _with_principal_points(
-    model: pycolmap.Reconstruction, camera_ids: Collection[int]
+    model: pycolmap.Reconstruction, camera_ids: Collection[int], progress: ItemProgress
 ) -> pycolmap.Reconstruction:
     photos = Counter(model.image(image_id).camera_id for image_id in model.reg_image_ids())
     free = {camera_id for camera_id in camera_ids if photos[camera_id] >= _MANY_PHOTOS}
@@ -134,7 +151,7 @@ def _with_principal_points(
     options = _robust_options(poses=True, intrinsics=True)
     options.refine_principal_point = True
     with quiet():
-        _adjust(adjusted, options, set(model.cameras) - free, poses=True)
+        _adjust(adjusted, options, set(model.cameras) - free, progress, poses=True)
     for camera_id in free:
         before, after = model.camera(camera_id), adjusted.camera(camera_id)
         moved = math.hypot(
@@ -179,6 +196,7 @@ def _robust_options(*, poses: bool, intrinsics: bool) -> pycolmap.BundleAdjustme
     options = _options(poses=poses, intrinsics=intrinsics)
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = _LOSS_SCALE_PX
+    options.ceres.solver_options.function_tolerance = _LEAST_CHANGE
     return options
 
 
@@ -186,6 +204,7 @@ def _adjust(
     model: pycolmap.Reconstruction,
     options: pycolmap.BundleAdjustmentOptions,
     constant: Collection[int],
+    progress: ItemProgress,
     *,
     poses: bool,
 ) -> None:
@@ -197,14 +216,30 @@ def _adjust(
         config.set_constant_cam_intrinsics(camera_id)
     if poses:
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    _solve(model, options, config)
+    _solve(model, options, config, progress)
 
 
 def _solve(
     model: pycolmap.Reconstruction,
     options: pycolmap.BundleAdjustmentOptions,
     config: pycolmap.BundleAdjustmentConfig,
+    progress: ItemProgress,
 ) -> None:
-    # pycolmap.bundle_adjustment prints to stderr regardless of options.
-    adjuster = pycolmap.create_default_bundle_adjuster(options, config, model)
-    interruptible(lambda token: adjuster.solve())  # noqa: ARG005  it cannot be cancelled
+    """Solve a few steps at a time, as pycolmap reports nothing, and lets no thread run meanwhile.
+
+    Nothing is lost between them but how far a step may go, which is handed on.
+    """
+    solver = options.ceres.solver_options
+    solver.max_num_iterations = _STEPS
+    for done in range(0, _MOST_STEPS, _STEPS):
+        progress(done, _MOST_STEPS)
+        # pycolmap.bundle_adjustment prints to stderr regardless of options.
+        adjuster = pycolmap.create_default_bundle_adjuster(options, config, model)
+        summary = interruptible(lambda token: adjuster.solve())  # noqa: ARG005,B023  not cancelled
+        if summary.termination_type != pycolmap.BundleAdjustmentTerminationType.NO_CONVERGENCE:
+            break
+        assert isinstance(summary, pycolmap.CeresBundleAdjustmentSummary)
+        if summary.ceres_summary.num_unsuccessful_steps == 0:
+            further = solver.initial_trust_region_radius * _FURTHER**_STEPS
+            solver.initial_trust_region_radius = min(further, solver.max_trust_region_radius)
+    progress(_MOST_STEPS, _MOST_STEPS)

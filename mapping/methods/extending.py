@@ -37,7 +37,10 @@ def with_late_photos(
 ) -> SparseModel:
     """Return a model with the photos that find a place in it late (``place_latecomers``)."""
     late = place_latecomers(photos, describe, matches, model, config, progress)
-    return extend(photos, model, late, config, work) if late.rows else model
+    extended = extend(photos, model, late, config, work) if late.rows else model
+    absent = model.views.count(None)
+    progress(absent, absent)
+    return extended
 
 
 def extend(

@@ -94,7 +94,7 @@ def place_latecomers(
     placed: list[int] = []
     total = len(waiting)
     while changed:
-        progress(len(placed), total)
+        progress(min(len(placed), total - 1), total)  # extending the model takes time too
         proposed |= {row: growing.propose(row) for row in sorted(changed)}
         changed = set()
         best = [(row, each) for row in sorted(waiting) for each in proposed[row]]

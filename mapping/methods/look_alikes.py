@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from mapping.methods.matching import Matches
 from mapping.methods.sparse_model import SfmPhoto
+from mapping.progress import ItemProgress, not_told
 
 # A keypoint is confirmed by a match with one of so many photos: those with most matches.
 _CONFIRMING = 4
@@ -44,28 +45,33 @@ _DAMPING = 1e-6
 _MAX_FITTED = 200
 
 
-def without_look_alikes(photos: Sequence[SfmPhoto], matches: Sequence[Matches]) -> list[Matches]:
+def without_look_alikes(
+    photos: Sequence[SfmPhoto], matches: Sequence[Matches], progress: ItemProgress = not_told
+) -> list[Matches]:
     """Return the pairs that are not contradicted by matches that are missing.
 
     Args:
         photos: in any order; those of one sensor are put in order of time.
         matches: verified.
+        progress: in pairs.
     """
     confirmed = _Confirmed(photos, matches)
     order = ranks_in_time(photos)
-    believed = [
-        _share_found(photos, confirmed, pair)
-        >= (_LEAST_NEAR if _are_near(photos, order, pair) else _LEAST_FAR)
-        for pair in matches
-    ]
+    believed = []
+    for done, pair in enumerate(matches):
+        progress(done, len(matches))
+        least = _LEAST_NEAR if _are_near(photos, order, pair) else _LEAST_FAR
+        believed.append(_share_found(photos, confirmed, pair) >= least)
     links = _Links(photos)
     for pair in compress(matches, believed):
         links.add(pair)
-    return [
+    kept = [
         pair
         for pair, known in zip(matches, believed, strict=True)
         if known or links.agree_with(pair)
     ]
+    progress(len(matches), len(matches))
+    return kept
 
 
 class _Links:

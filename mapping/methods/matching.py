@@ -53,6 +53,16 @@ class Matches:
     rows: NDArray[np.uint32]
 
 
+def matches_among(rows: Sequence[int], matches: Sequence[Matches]) -> list[Matches]:
+    """Return the matches between some photos, which are numbered in the order of their rows."""
+    number = {row: order for order, row in enumerate(rows)}
+    return [
+        Matches(number[pair.first], number[pair.second], pair.rows)
+        for pair in matches
+        if pair.first in number and pair.second in number
+    ]
+
+
 @dataclass(frozen=True, slots=True)
 class Verification:
     """The test that matches of two photos must pass.

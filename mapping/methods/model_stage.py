@@ -1,8 +1,8 @@
-"""The stage of a build that makes a sparse model of matches; a worker does it as a whole."""
+"""The stages of a build that make sparse models of matches; a worker does each as a whole."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 
@@ -12,10 +12,17 @@ from numpy.typing import NDArray
 from mapping.methods.colmap_scene import Rigs
 from mapping.methods.extending import with_late_photos
 from mapping.methods.intrinsics import Doubt
+from mapping.methods.look_alikes import without_look_alikes
 from mapping.methods.matching import Matches, camera_values, pose_values
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.methods.sparse_model import MAPPER_CONFIGS, SfmPhoto, SparseModel
-from mapping.methods.triangulation import MAPPING, TRIANGULATION, triangulate
+from mapping.methods.triangulation import (
+    ADJUSTMENT,
+    LOOK_ALIKES,
+    MAPPING,
+    TRIANGULATION,
+    triangulate,
+)
 from mapping.methods.undoing import reconstruct_places
 from mapping.progress import Progress
 from mapping.stages.context import BuildContext
@@ -26,7 +33,7 @@ from mapping.stages.work_folder import Item, WorkFolder, key_of
 from visloc.geometry import Camera, Pose
 
 # Raised when the code of the stage changes what comes out.
-_REVISION = 13
+_REVISION = 14
 _LATE_REVISION = 2
 _LATE = "late photos"
 _LARGEST = 127  # of descriptors in 8 bits
@@ -47,12 +54,10 @@ def make_model(
     Raises:
         InvalidInput: ``sfm.*``.
     """
-    # A map to pair by is not needed any more, and is not sent to a worker.
-    sent = replace(settings, covisible_in=None)
-    task = _ModelTask(context.work, tuple(photos), context.features, rigs, matches, sent)
+    inputs = _Inputs.of(context, photos, matches, settings)
     key = _model_key(matches_key, photos, rigs, settings)
     stage = MAPPING if settings.estimate_poses else TRIANGULATION
-    context.workers.run_one(task.make, key, stage, context.progress)
+    context.workers.run_one(partial(_make, inputs, rigs), key, stage, context.progress)
     return _from_item(context.work.read(key), photos)
 
 
@@ -64,13 +69,17 @@ def with_latecomers(
     matches_key: str,
     settings: SfmSettings,
 ) -> SparseModel:
-    """Place photos that a model without rigs left out, where they show what it has there.
+    """Place photos that a model left out, where they show what it has there.
+
+    A model on rigs, or one whose pairs were undone because they joined two places, stays as it is.
 
     Args:
         matches: verified, of pairs with at least these photos.
         matches_key: stands for them in the key of the result.
     """
-    task = _LateTask(context.work, tuple(photos), context.features, model, matches, settings)
+    if None not in model.views or model.undone or model.on_rigs:
+        return model
+    inputs = _Inputs.of(context, photos, matches, settings)
     poses = [None if view is None else pose_values(view.cam_from_world) for view in model.views]
     key = key_of(
         "late_photos",
@@ -79,90 +88,139 @@ def with_latecomers(
         poses=poses,
         model=_model_key("", photos, {}, settings),
     )
-    context.workers.run_one(task.make, key, _LATE, context.progress)
+    context.workers.run_one(partial(_place, inputs, model), key, _LATE, context.progress)
     return _from_item(context.work.read(key), photos)
 
 
 def without_poses(context: BuildContext, photos: Sequence[MappingPhoto]) -> list[SfmPhoto]:
     """Return the mapper's view of photos whose poses are estimated."""
-    return [_given(context.features, photo, posed=False) for photo in photos]
+    return _given(context.features, photos, posed=False)
+
+
+def believed_pairs(
+    context: BuildContext,
+    photos: Sequence[MappingPhoto],
+    matches: Sequence[Matches],
+    matches_key: str,
+    settings: SfmSettings,
+) -> list[Matches]:
+    """Return the pairs of photos without poses that seem to show one place.
+
+    Among some of the photos, fewer matches would be missed: all photos tell more.
+    """
+    inputs = _Inputs.of(context, photos, matches, settings)
+    model = _model_key(matches_key, photos, {}, settings)
+    key = key_of("believed_pairs", 1, model=model)
+    context.workers.run_one(partial(_believe, inputs), key, LOOK_ALIKES, context.progress)
+    return [matches[row] for row in context.work.read(key)["pairs"].tolist()]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _ModelTask:
-    """A worker's part, for the whole map."""
+class _Inputs:
+    """What a worker needs for a stage of the whole map."""
 
     work: WorkFolder
     photos: tuple[MappingPhoto, ...]
     features: LocalFeaturesSource
-    rigs: Rigs
     matches: Sequence[Matches]
     settings: SfmSettings
 
-    def make(self, key: str, progress: Progress) -> None:
-        def compute() -> Item:
-            posed = not self.settings.estimate_poses
-            given = [_given(self.features, photo, posed=posed) for photo in self.photos]
-            config, refine = MAPPER_CONFIGS[self.settings.mapper], self.settings.refine
-            inputs = self.rigs, self.matches, config, refine, self.work.scratch
-            if self.settings.estimate_poses:
-                return _to_item(reconstruct_places(given, self._describe, *inputs, progress))
-            return _to_item(triangulate(given, *inputs, partial(progress, TRIANGULATION)))
+    @staticmethod
+    def of(
+        context: BuildContext,
+        photos: Sequence[MappingPhoto],
+        matches: Sequence[Matches],
+        settings: SfmSettings,
+    ) -> _Inputs:
+        # A map to pair by is not needed any more, and is not sent to a worker.
+        sent = replace(settings, covisible_in=None)
+        return _Inputs(context.work, tuple(photos), context.features, matches, sent)
 
-        stages = (MAPPING, TRIANGULATION) if self.settings.estimate_poses else (TRIANGULATION,)
+    def given(self, *, posed: bool) -> list[SfmPhoto]:
+        return _given(self.features, self.photos, posed=posed)
+
+    def describe(self, row: int) -> NDArray[np.int8]:
+        # One scale for all: they are unit rows.
+        return np.rint(_LARGEST * self.features.read(self.photos[row]).descriptors).astype(np.int8)
+
+    def keep(
+        self, key: str, stages: Sequence[str], progress: Progress, compute: Callable[[], Item]
+    ) -> None:
+        """Compute a result, or tell that the stages of one that is there are done."""
+        count = len(self.photos)
         if self.work.has(key):
             for stage in stages:
-                progress(stage, len(self.photos), len(self.photos))
+                progress(stage, count, count)
             return
-        progress(stages[0], 0, len(self.photos))
+        progress(stages[0], 0, count)
         self.work.get(key, compute)
 
-    def _describe(self, row: int) -> NDArray[np.int8]:
-        return _described(self.features, self.photos[row])
+
+def _given(
+    features: LocalFeaturesSource, photos: Sequence[MappingPhoto], *, posed: bool
+) -> list[SfmPhoto]:
+    return [
+        SfmPhoto(
+            name=photo.name,
+            sensor=photo.record.sensor_id,
+            timestamp=photo.record.timestamp,
+            camera=photo.camera,
+            camera_known=photo.camera_known,
+            cam_from_world=photo.pose if posed else None,
+            keypoints=features.read(photo).keypoints,
+        )
+        for photo in photos
+    ]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _LateTask:
-    """A worker's part, for the photos that a model left out."""
-
-    work: WorkFolder
-    photos: tuple[MappingPhoto, ...]
-    features: LocalFeaturesSource
-    model: SparseModel
-    matches: Sequence[Matches]
-    settings: SfmSettings
-
-    def make(self, key: str, progress: Progress) -> None:
-        def compute() -> Item:
-            given = [_given(self.features, photo, posed=False) for photo in self.photos]
-            config, told = MAPPER_CONFIGS[self.settings.mapper], partial(progress, _LATE)
-            inputs = given, self._describe, self.matches, self.model, config
-            return _to_item(with_late_photos(*inputs, self.work.scratch, told))
-
-        if not self.work.has(key):
-            self.work.get(key, compute)
-        absent = self.model.views.count(None)
-        progress(_LATE, absent, absent)
-
-    def _describe(self, row: int) -> NDArray[np.int8]:
-        return _described(self.features, self.photos[row])
-
-
-def _described(features: LocalFeaturesSource, photo: MappingPhoto) -> NDArray[np.int8]:
-    # One scale for all: they are unit rows.
-    return np.rint(_LARGEST * features.read(photo).descriptors).astype(np.int8)
-
-
-def _given(features: LocalFeaturesSource, photo: MappingPhoto, *, posed: bool) -> SfmPhoto:
-    return SfmPhoto(
-        name=photo.name,
-        sensor=photo.record.sensor_id,
-        timestamp=photo.record.timestamp,
-        camera=photo.camera,
-        camera_known=photo.camera_known,
-        cam_from_world=photo.pose if posed else None,
-        keypoints=features.read(photo).keypoints,
+def _make(inputs: _Inputs, rigs: Rigs, key: str, progress: Progress) -> None:
+    """Make a sparse model in a worker."""
+    settings, posed = inputs.settings, not inputs.settings.estimate_poses
+    adjusted = (ADJUSTMENT,) if settings.refine else ()
+    stages = (
+        (TRIANGULATION, *adjusted) if posed else (LOOK_ALIKES, MAPPING, ADJUSTMENT, TRIANGULATION)
     )
+
+    def compute() -> Item:
+        given, config = inputs.given(posed=posed), MAPPER_CONFIGS[settings.mapper]
+        how = rigs, inputs.matches, config, settings.refine, inputs.work.scratch, progress
+        if posed:
+            return _to_item(triangulate(given, *how))
+        return _to_item(reconstruct_places(given, inputs.describe, *how))
+
+    inputs.keep(key, stages, progress, compute)
+
+
+def _place(inputs: _Inputs, model: SparseModel, key: str, progress: Progress) -> None:
+    """Place photos that a model left out, in a worker."""
+
+    def compute() -> Item:
+        return _to_item(
+            with_late_photos(
+                inputs.given(posed=False),
+                inputs.describe,
+                inputs.matches,
+                model,
+                MAPPER_CONFIGS[inputs.settings.mapper],
+                inputs.work.scratch,
+                partial(progress, _LATE),
+            )
+        )
+
+    inputs.keep(key, (_LATE,), progress, compute)
+
+
+def _believe(inputs: _Inputs, key: str, progress: Progress) -> None:
+    """Find pairs of one place, in a worker."""
+
+    def compute() -> Item:
+        told = partial(progress, LOOK_ALIKES)
+        kept = without_look_alikes(inputs.given(posed=False), inputs.matches, told)
+        pairs = {(pair.first, pair.second) for pair in kept}
+        rows = [row for row, p in enumerate(inputs.matches) if (p.first, p.second) in pairs]
+        return {"pairs": np.array(rows, dtype=np.int64)}
+
+    inputs.keep(key, (LOOK_ALIKES,), progress, compute)
 
 
 def _model_key(

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mapping.methods.matching import Matches
+from mapping.methods.matching import Matches, matches_among
 from mapping.methods.sparse_model import SparseModel
 from visloc.errors import InvalidInput
 
@@ -36,14 +36,8 @@ def models_beside(
     found: list[SparseModel] = []
     left = [row for row, view in enumerate(largest.views) if view is None]
     while len(left) >= MIN_PHOTOS:
-        number = {row: order for order, row in enumerate(left)}
-        among = [
-            Matches(number[pair.first], number[pair.second], pair.rows)
-            for pair in matches
-            if pair.first in number and pair.second in number
-        ]
         try:
-            model = make(left, among)
+            model = make(left, matches_among(left, matches))
         except InvalidInput:
             break  # what is left shows nothing in common
         model = _of_all(model, left, len(largest.views))

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,9 +24,15 @@ from mapping.methods.intrinsics import (
     notes_on,
     origin_of,
 )
-from mapping.methods.look_alikes import without_look_alikes
-from mapping.methods.matching import Matches, Verification, find_fixed, match_pairs, outside_fixed
-from mapping.methods.model_stage import make_model, with_latecomers, without_poses
+from mapping.methods.matching import (
+    Matches,
+    Verification,
+    find_fixed,
+    match_pairs,
+    matches_among,
+    outside_fixed,
+)
+from mapping.methods.model_stage import believed_pairs, make_model, with_latecomers, without_poses
 from mapping.methods.pair_agreement import doubts_about_poses
 from mapping.methods.pieces import models_beside
 from mapping.methods.scenes import find_pairs, make_scene
@@ -109,6 +114,23 @@ def landmarks_from_matches(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class _Matched:
+    """Photos, matches between them, and what stands for these in the key of a result."""
+
+    photos: Sequence[MappingPhoto]
+    matches: Sequence[Matches]
+    key: str
+
+    def some(self, rows: Sequence[int]) -> _Matched:
+        """Return some of the photos, and the matches between them."""
+        return _Matched(
+            [self.photos[row] for row in rows],
+            matches_among(rows, self.matches),
+            key_of("matches_of_some", 1, matches=self.key, photos=list(rows)),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _Look:
     """A second look at photos that found no place while poses were estimated."""
 
@@ -143,27 +165,24 @@ class _Look:
             else:
                 pairs = self.pairs[_with_their_groups(self.pairs, absent)]
                 of_absent = match_pairs(self.context, found, pairs, self.verification)
-        if None in model.views and not (model.undone or model.on_rigs):
-            photos = self.photos if found is None else found
-            model = with_latecomers(self.context, photos, model, *of_absent, self.settings)
-        given = without_poses(self.context, begun)
-        # Among some of the photos, fewer matches would be missed: all photos tell more.
-        believed = without_look_alikes(given, matches)
-        beside = models_beside(model, believed, partial(self._of_some, begun, matches_key))
-        error = self.verification.max_error_px
-        return [(one, doubts_about_poses(one, given, believed, error)) for one in (model, *beside)]
+        verified = _Matched(self.photos if found is None else found, *of_absent)
+        model = self._with_late(model, verified)
+        believed = believed_pairs(self.context, begun, matches, matches_key, self.settings)
+        whole = _Matched(begun, believed, matches_key)
 
-    def _of_some(
-        self,
-        photos: Sequence[MappingPhoto],
-        matches_key: str,
-        rows: Sequence[int],
-        matches: Sequence[Matches],
-    ) -> SparseModel:
-        """Make a model of some of the photos, with the matches between them."""
-        some_photos = [photos[row] for row in rows]
-        key = key_of("matches_of_some", 1, matches=matches_key, photos=list(rows))
-        return make_model(self.context, some_photos, self.rigs, matches, key, self.settings)
+        def make(rows: Sequence[int], among: Sequence[Matches]) -> SparseModel:
+            part = whole.some(rows)
+            piece = make_model(self.context, part.photos, self.rigs, among, part.key, self.settings)
+            return self._with_late(piece, verified.some(rows))
+
+        made = (model, *models_beside(model, believed, make))
+        given, error = without_poses(self.context, begun), self.verification.max_error_px
+        return [(one, doubts_about_poses(one, given, believed, error)) for one in made]
+
+    def _with_late(self, model: SparseModel, verified: _Matched) -> SparseModel:
+        return with_latecomers(
+            self.context, verified.photos, model, verified.matches, verified.key, self.settings
+        )
 
 
 def _with_their_groups(pairs: NDArray[np.int64], absent: NDArray[np.bool_]) -> NDArray[np.bool_]:

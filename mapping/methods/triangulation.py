@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -14,8 +14,8 @@ import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
 import pycolmap
 
 from mapping.methods.adjustment import adjusted_robustly, error_rises, refine_model
-from mapping.methods.colmap_calls import interruptible, quiet
 from mapping.methods.colmap_scene import ColmapScene, Rigs, colmap_database
+from mapping.methods.incremental import largest_model
 from mapping.methods.intrinsics import (
     Doubt,
     doubt_of,
@@ -24,15 +24,16 @@ from mapping.methods.intrinsics import (
     no_lens,
 )
 from mapping.methods.look_alikes import without_look_alikes
-from mapping.methods.matching import Matches
+from mapping.methods.matching import Matches, matches_among
 from mapping.methods.points import triangulate_points
 from mapping.methods.sparse_model import MapperConfig, SfmPhoto, SparseModel, without_bad_points
 from mapping.methods.thinning import thin
-from mapping.progress import ItemProgress, Progress
+from mapping.progress import ItemProgress, Progress, not_told
 from visloc.errors import VislocError, refuse
 
 # Stages of a build.
-MAPPING, TRIANGULATION = "incremental mapping", "triangulation"
+LOOK_ALIKES, MAPPING = "look-alike pairs", "incremental mapping"
+ADJUSTMENT, TRIANGULATION = "adjustment", "triangulation"
 # Least angle between the rays of the two photos that the mapper begins with, in the median. With
 # COLMAP's 16 degrees they may be far apart and share few matches; what they make places others.
 _FIRST_ANGLE_DEG = 4.0
@@ -47,7 +48,7 @@ def triangulate(
     config: MapperConfig,
     refine: Sequence[str],
     work: Path,
-    progress: ItemProgress,
+    progress: Progress,
 ) -> SparseModel:
     """Triangulate points with the poses of the photos.
 
@@ -59,23 +60,27 @@ def triangulate(
         refine: names of ``REFINABLE``: what bundle adjustment may change afterwards. Refined poses
             are aligned to the given ones again. Intrinsics in doubt (``SparseModel.doubts``) stay.
         work: folder for temporary files.
-        progress: as ``triangulate_points``.
+        progress: of the stages ``TRIANGULATION``, as ``triangulate_points``, and where something is
+            refined ``ADJUSTMENT``, in steps of bundle adjustments.
 
     Raises:
         InvalidInput: ``sfm.no_matches``, ``sfm.no_points``.
     """
+    adjusting = partial(progress, ADJUSTMENT)
     with colmap_database(photos, rigs, matches, work) as (path, scene):
         options = pipeline_options(config)
 
         def solve(held: Collection[str]) -> pycolmap.Reconstruction:
             model = scene.with_poses(photos)
-            triangulate_points(model, path, options, progress)
+            triangulate_points(model, path, options, partial(progress, TRIANGULATION))
             if refine:
-                refine_model(model, photos, scene, refine, held)
+                refine_model(model, photos, scene, refine, held, adjusting)
             return model
 
         refined = set(scene.cameras) if "intrinsics" in refine else set()
-        result, doubts = solve_with_priors(solve, scene, photos, refined, poses="poses" in refine)
+        result, doubts = solve_with_priors(
+            solve, scene, photos, refined, adjusting, poses="poses" in refine
+        )
     return without_bad_points(scene.read(result, photos, refine, doubts), config)
 
 
@@ -93,17 +98,17 @@ def reconstruct(
     Known intrinsics stay unless ``refine`` names them, and also if they are in doubt
     (``SparseModel.doubts``). Pairs that seem to show two places are not used
     (``mapping.methods.look_alikes``). Of several models that do not connect, the largest is taken.
-    ``progress`` is called with the number of photos in the current model, and of all photos, and
-    then as by ``triangulate_points``; the stages are ``MAPPING`` and ``TRIANGULATION``.
+    The stages of ``progress`` are ``LOOK_ALIKES``, in pairs, ``MAPPING`` as ``largest_model``,
+    ``ADJUSTMENT`` in steps of bundle adjustments, and ``TRIANGULATION`` as ``triangulate_points``.
 
     Raises:
         InvalidInput: ``sfm.no_matches``, ``sfm.no_model``, ``sfm.camera``, ``sfm.no_points``.
     """
-    matches = without_look_alikes(photos, matches)
+    matches = without_look_alikes(photos, matches, partial(progress, LOOK_ALIKES))
+    adjusting = partial(progress, ADJUSTMENT)
     with colmap_database(photos, rigs, thin(photos, matches), work) as (path, scene):
         known = {photo.sensor for photo in photos if photo.camera_known}
         constant = set() if "intrinsics" in refine else known
-        placed = _Placed(len(photos), partial(progress, MAPPING))
 
         def options_with(doubts: Mapping[str, Doubt]) -> pycolmap.IncrementalPipelineOptions:
             options = pipeline_options(config)
@@ -116,20 +121,17 @@ def reconstruct(
 
         def solve(doubts: Mapping[str, Doubt]) -> pycolmap.Reconstruction:
             left_out = doubts.keys() - known
-            models = _map_incrementally(path, options_with(doubts), placed)
-            if models:
-                return max(models.values(), key=lambda m: (m.num_reg_images(), m.num_points3D()))
-            raise _no_model(photos, matches, doubts, left_out)
+            model = largest_model(path, options_with(doubts), partial(progress, MAPPING))
+            if model is None:
+                raise _no_model(photos, matches, doubts, left_out)
+            return model
 
         refined = scene.cameras.keys() - constant
-        result, doubts = solve_with_priors(solve, scene, photos, refined, poses=True)
+        result, doubts = solve_with_priors(solve, scene, photos, refined, adjusting, poses=True)
         sure = {scene.camera_ids[sensor] for sensor in refined - doubts.keys()}
-        result = adjusted_robustly(result, sure)
+        result = adjusted_robustly(result, sure, adjusting)
         found = scene.read(result, photos, ("poses", "intrinsics"), doubts)
-    progress(MAPPING, len(photos), len(photos))
-    return _with_all_points(
-        found, photos, rigs, matches, config, work, partial(progress, TRIANGULATION)
-    )
+    return _with_all_points(found, photos, rigs, matches, config, work, progress)
 
 
 def _no_model(
@@ -160,21 +162,16 @@ def _with_all_points(
     matches: Sequence[Matches],
     config: MapperConfig,
     work: Path,
-    progress: ItemProgress,
+    progress: Progress,
 ) -> SparseModel:
     """Triangulate all matches with the poses and cameras that a part of them gave."""
     rows = [row for row, view in enumerate(found.views) if view is not None]
-    number = {row: order for order, row in enumerate(rows)}
     placed = [
         replace(photos[row], camera=view.camera, cam_from_world=view.cam_from_world)
         for row, view in enumerate(found.views)
         if view is not None
     ]
-    among = [
-        Matches(number[pair.first], number[pair.second], pair.rows)
-        for pair in matches
-        if pair.first in number and pair.second in number
-    ]
+    among = matches_among(rows, matches)
     # On rigs, if at all, as in the model: they have its unit.
     made = triangulate(placed, rigs if found.on_rigs else {}, among, config, (), work, progress)
     views = np.array(rows)[made.observations.views]
@@ -187,50 +184,12 @@ def _with_all_points(
     )
 
 
-@dataclass(slots=True)
-class _Placed:
-    """Counts the photos in the current model, and reports them."""
-
-    total: int
-    progress: ItemProgress
-    count: int = 0
-
-    def first_pair(self) -> None:
-        self._report(2)
-
-    def one_more(self) -> None:
-        self._report(self.count + 1)
-
-    def _report(self, placed: int) -> None:
-        self.count = placed
-        # Never all: the work after the last photo takes long too.
-        self.progress(min(placed, self.total - 1), self.total)
-
-
-def _map_incrementally(
-    path: Path, options: pycolmap.IncrementalPipelineOptions, placed: _Placed
-) -> dict[int, pycolmap.Reconstruction]:
-    if not options.image_names:  # pycolmap would take all photos
-        return {}
-    with quiet(errors=False):  # that there is no model is not always an error
-        return interruptible(
-            lambda token: pycolmap.incremental_mapping(
-                path,
-                path.parent,
-                path.parent,
-                options=options,
-                initial_image_pair_callback=placed.first_pair,
-                next_image_callback=placed.one_more,
-                cancellation_token=token,
-            )
-        )
-
-
 def solve_with_priors(
     solve: Callable[[dict[str, Doubt]], pycolmap.Reconstruction],
     scene: ColmapScene,
     photos: Sequence[SfmPhoto],
     refined: Collection[str],
+    progress: ItemProgress = not_told,
     *,
     poses: bool,
 ) -> tuple[pycolmap.Reconstruction, dict[str, Doubt]]:
@@ -244,6 +203,7 @@ def solve_with_priors(
         solve: makes a model, given doubts. Sensors in doubt that have a prior keep it; photos of
             the others are left out.
         refined: sensors whose intrinsics ``solve`` refines.
+        progress: of judging the cameras, in steps of bundle adjustments.
         poses: whether it refines poses too.
 
     Returns:
@@ -254,7 +214,7 @@ def solve_with_priors(
     for judgements in count(1):
         model = solve(doubts)
         free = _free_cameras(model, scene, refined, doubts)
-        found = _judge(model, free, priors, poses=poses)
+        found = _judge(model, free, priors, progress, poses=poses)
         again = {
             sensor: doubt
             for sensor, doubt in found.items()
@@ -293,12 +253,13 @@ def _judge(
     model: pycolmap.Reconstruction,
     free: Mapping[int, str],
     priors: Mapping[str, float | None],
+    progress: ItemProgress,
     *,
     poses: bool,
 ) -> dict[str, Doubt]:
     """Return the doubts about refined cameras, by sensor."""
     sound = [camera_id for camera_id in free if is_plausible(model.camera(camera_id))]
-    rises = error_rises(model, sound, poses=poses) if sound else {}
+    rises = error_rises(model, sound, progress, poses=poses) if sound else {}
     return {
         sensor: doubt
         for camera_id, sensor in free.items()

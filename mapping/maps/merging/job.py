@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mapping.build.pieces import without_pieces
 from mapping.maps.editing import content_of, joined, moved, refuse_other_features, same_model
 from mapping.maps.merging.registration import Registration, register, updates_of
 from mapping.maps.sets import publish_set
@@ -178,7 +179,7 @@ def _joined(
         content,
         method=first.method if first.method == second.method else "merged",
         settings={
-            **first.settings,
+            **without_pieces(first.settings),
             **origins_record(a, b, content.images),
             **({"updates": updates} if updates else {}),
         },

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mapping.build.pieces import without_pieces
 from mapping.cluster.storage import map_folder, work_place
 from mapping.cluster.workers import Workers
 from mapping.maps.editing import content_of, joined
@@ -295,7 +296,7 @@ class _Job:
         record = self._record(placement, content, whole)
         before = content.settings.get("updates", [])
         assert isinstance(before, list)
-        settings = {**content.settings, "updates": [*before, asdict(record)]}
+        settings = {**without_pieces(content.settings), "updates": [*before, asdict(record)]}
         return replace(whole, settings=settings), pictures, record, tuple(part.notes)
 
     @property

@@ -13,12 +13,15 @@ import pytest
 
 from mapping.build.build import build_map
 from mapping.build.pieces import (
+    PIECES,
     WrittenMap,
     ids_of_pieces,
     note_of_piece,
     pieces_of,
     publish_pieces,
     refuse_long_id,
+    use_version,
+    without_pieces,
 )
 from mapping.build.settings import BuildSettings
 from mapping.frames.anchor import align_poses
@@ -28,7 +31,7 @@ from mapping.own_test.publishing import write_content
 from mapping.sample import write_sample
 from visloc.archive import Map, MapStore, open_map
 from visloc.archive.schema import Doubt
-from visloc.errors import Conflict, InvalidInput
+from visloc.errors import Conflict, InvalidInput, NotFound
 from visloc.features import make_local_features
 from visloc.geometry import Pose
 from visloc.images import read_photo_file
@@ -115,8 +118,8 @@ def test_each_room_is_a_map_of_its_own(built: Path) -> None:
 def test_the_largest_names_the_other(built: Path) -> None:
     store = MapStore(built)
     largest, other = store.open("home"), store.open("home-2")
-    assert pieces_of(largest) == [other.ref]
-    assert pieces_of(other) == []
+    assert pieces_of(largest.manifest) == [other.ref]
+    assert pieces_of(other.manifest) == []
     assert any(f"{other.ref} of {IN_ROOM[1]} photos" in n for n in largest.manifest.notes)
     assert note_of_piece("home-2", "home") in other.manifest.notes
 
@@ -166,13 +169,18 @@ Written = Callable[..., WrittenMap]
 def written(sample_map: Map, tmp_path: Path) -> Written:
     """Write a version of a map without publishing it."""
 
-    def write(map_id: str, *, doubtful: bool = False) -> WrittenMap:
+    def write(
+        map_id: str, *beside: WrittenMap, doubtful: bool = False, is_build: bool = True
+    ) -> WrittenMap:
         folder = tmp_path / "incoming" / map_id
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         notes = () if map_id == "home" else (note_of_piece(map_id, "home"),)
         doubts = [Doubt(kind="own_test", message="it is wrong", photos=())] * doubtful
         content = replace(content_of(sample_map), notes=notes)
+        if map_id == "home" and is_build:
+            pieces = {PIECES: [each.ref for each in beside]}
+            content = replace(content, settings={**content.settings, **pieces})
         version = write_content(folder, content, map_id, examine=lambda _: doubts)
         return WrittenMap(folder, map_id, version, len(sample_map.images))
 
@@ -227,6 +235,53 @@ def test_a_piece_in_doubt_is_not_put_into_use_nor_left_as_it_was(
     publish(store, *again)
     assert in_use(store) == {"home": again[0].version}
     assert again[1].version in store.versions("home-2")
+
+
+def test_to_use_a_build_in_doubt_replaces_the_pieces_of_the_build_before(
+    store: MapStore, written: Written
+) -> None:
+    old = written("home-2"), written("home-3")
+    before = written("home", *old)
+    publish(store, before, *old)
+    one, doubtful = written("home-2"), written("home-4", doubtful=True)
+    again = written("home", one, doubtful, doubtful=True)
+    publish(store, again, one, doubtful)
+    assert in_use(store) == {each.map_id: each.version for each in (before, *old)}
+    assert use_version(store, "home", again.version) == [again.ref, one.ref]
+    assert in_use(store) == {"home": again.version, "home-2": one.version}
+    # And back again.
+    assert use_version(store, "home", before.version) == [before.ref, *(each.ref for each in old)]
+    assert in_use(store) == {each.map_id: each.version for each in (before, *old)}
+
+
+def test_to_use_a_version_that_no_build_made_leaves_pieces_alone(
+    store: MapStore, written: Written
+) -> None:
+    piece = written("home-2")
+    first = written("home", piece)
+    publish(store, first, piece)
+    updated = written("home", is_build=False)
+    store.publish(updated.folder, "home", updated.version)
+    assert use_version(store, "home", first.version) == [first.ref, piece.ref]
+    assert use_version(store, "home", updated.version) == [updated.ref]
+    assert use_version(store, "home-2", piece.version) == [piece.ref]
+    assert in_use(store) == {"home": updated.version, "home-2": piece.version}
+    with pytest.raises(NotFound):
+        use_version(store, "home", "none")
+
+
+def test_a_removed_piece_is_not_missed(store: MapStore, written: Written) -> None:
+    piece, other = written("home-2"), written("home-3")
+    first = written("home", piece, other)
+    publish(store, first, piece, other)
+    again = written("home")
+    publish(store, again)
+    store.remove("home-2", piece.version)
+    assert use_version(store, "home", first.version) == [first.ref, other.ref]
+
+
+def test_what_is_made_of_a_build_does_not_name_its_pieces() -> None:
+    assert without_pieces({"pairs": "retrieval", PIECES: ["home-2@1"]}) == {"pairs": "retrieval"}
 
 
 def test_a_killed_publication_leaves_the_largest_as_it_was(

@@ -31,9 +31,10 @@ def moved(pose: Pose, by: tuple[float, float, float]) -> Pose:
     return Pose(pose.rotation, pose.translation - np.array(by))
 
 
-def film() -> FilmedVideo:
-    """What was seen: each step moves the picture by 8 px of 640."""
-    motion = Motion(np.arange(FRAMES) / 5, np.ones(FRAMES), np.arange(FRAMES) * 8 / 640)
+def film(fast: Collection[int] = ()) -> FilmedVideo:
+    """What was seen: each step moves the picture by 8 px of 640, and by 160 to a ``fast`` frame."""
+    steps = np.array([8 / 640 if row not in fast else 160 / 640 for row in range(FRAMES)])
+    motion = Motion(np.arange(FRAMES) / 5, np.ones(FRAMES), np.cumsum(steps))
     chosen = ChosenFrames(np.arange(FRAMES), np.zeros(FRAMES, bool))
     facts = VideoFacts(640, 480, FRAMES / 5, "", None, None)
     return FilmedVideo(Path("walk.mp4"), "", facts, motion, chosen)
@@ -85,6 +86,13 @@ def test_a_fast_step_is_no_jump_where_landmarks_confirm_it() -> None:
     poses = [Pose(np.eye(3), np.array([-way, 0.0, 0.0])) for way in ways]
     assert out_of_order(opened(poses), {"walk": film()}) == []
     assert len(out_of_order(opened(poses, range(12)), {"walk": film()})) == 12
+
+
+def test_one_stray_frame_takes_none_along_that_share_landmarks_with_those_before() -> None:
+    """The frame after it was seen to move so far that its poses do not contradict the stray one."""
+    stray = [moved(p, AWAY) if row == 11 else p for row, p in enumerate(WALK)]
+    (name,) = out_of_order(opened(stray, [11]), {"walk": film(fast=[12])})
+    assert name == f"walk/{film().names[11]}"
 
 
 def test_a_film_that_jumps_is_in_doubt_and_a_stray_frame_is_not() -> None:
