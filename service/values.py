@@ -281,3 +281,10 @@ class SequenceStep(NamedTuple):
     maps: tuple[str, ...]
     answers: list[Localization]
     pose: RigPose | None
+
+
+class Abandoned(Exception):
+    """Nobody waits for a task any more: what a worker says of it.
+
+    It is here because the main process, which unpickles it, must not load a worker's libraries.
+    """

@@ -85,12 +85,22 @@ def connections_command(
     balancer: Annotated[
         bool, typer.Option(help="Attack one replica through HAProxy, from one address.")
     ] = False,
+    files: Annotated[
+        list[int] | None, typer.Option(help="Most open files; 1024 and 65536 if not given.")
+    ] = None,
+    tls: Annotated[
+        bool | None, typer.Option(help="Only with TLS, or only without; both if not given.")
+    ] = None,
 ) -> None:
-    """Idle, slow and flooding connections, with 1024 and 65536 open files, without and with TLS."""
+    """Idle, slow and flooding connections, with few and many open files, without and with TLS."""
     strength = Strength(count, seconds, pause, kinds)
-    withstood = behind_balancer if balancer else connections
     with _prepared() as (maps, work):
-        print_checks("connections", asyncio.run(withstood(maps, work, strength)))
+        if balancer:
+            withstood = behind_balancer(maps, work, strength)
+        else:
+            both = (False, True) if tls is None else (tls,)
+            withstood = connections(maps, work, strength, files or (1024, 65536), tls=both)
+        print_checks("connections", asyncio.run(withstood))
 
 
 @app.command("heavy-photos")

@@ -17,11 +17,13 @@ class Check:
         must_hold: the condition, in words.
         measured: what was found.
         holds: whether it did.
+        is_speed: whether that depends on what else the machine does.
     """
 
     must_hold: str
     measured: str
     holds: bool
+    is_speed: bool = False
 
 
 def print_checks(test: str, checks: Sequence[Check]) -> None:

@@ -76,6 +76,7 @@ async def kill_workers(maps: SampleMaps, work: Path, kills: int) -> list[Check]:
             "another takes its place, maps open and warm, within 10 s",
             f"at most {max(replaced):.1f} s",
             max(replaced) < BACK_WITHIN_S,
+            is_speed=True,
         ),
     ]
 
@@ -109,6 +110,7 @@ async def kill_service(maps: SampleMaps, work: Path, kills: int) -> list[Check]:
             "started again, it is ready and gives a pose within 10 s",
             f"{kills} kills: ready after {ready:.1f} s, a pose after {answer:.1f} s at most",
             answer < BACK_WITHIN_S,
+            is_speed=True,
         ),
         Check(
             "clients see connections that break, then the service that starts",

@@ -9,7 +9,7 @@ import math
 import socket
 import ssl
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from time import monotonic
 from typing import Any
 
@@ -129,21 +129,24 @@ class OpenConnections:
         """
         if len(self._open) < self.limit:
             return 0.0
-        wait_s = math.inf
-        for each, since in self._ranked():
-            wait_s = min(wait_s, since + _LEAST_IDLE_S - monotonic())
-            if wait_s <= 0:
-                self._close(each)
-                return 0.0
-        return wait_s
+        found = self._next_to_close()
+        if found is None:
+            return math.inf
+        connection, since = found
+        # One that has its time yet is waited for: the next best may be that of an honest client.
+        wait_s = since + _LEAST_IDLE_S - monotonic()
+        if wait_s > 0:
+            return wait_s
+        self._close(connection)
+        return 0.0
 
     def close_idle(self, most: int) -> None:
         """Close the longest idle connections."""
         for _ in range(most):
-            idlest = next(self._ranked(), None)
-            if idlest is None:
+            found = self._next_to_close()
+            if found is None:
                 return
-            self._close(idlest[0])
+            self._close(found[0])
 
     def close_unopened(self) -> None:
         """Close the connections that are still in their TLS handshake."""
@@ -151,16 +154,13 @@ class OpenConnections:
             if each.opening is not None and not each.opening.done():
                 self._close(each)
 
-    def _ranked(self) -> Iterator[tuple[Connection, float]]:
-        """Give what may be closed, the best first, and since when it has waited."""
+    def _next_to_close(self) -> tuple[Connection, float] | None:
+        """Return what gives way to a new connection, and since when it has waited."""
         arriving = _longest(self._arriving)
         if arriving is not None and self.is_crowded:
-            yield arriving
+            return arriving
         kinds = sorted((self._new, self._idle), key=len, reverse=True)
-        longest = [found for each in kinds if (found := _longest(each)) is not None]
-        yield from longest
-        if arriving is not None and not longest:
-            yield arriving
+        return _longest(kinds[0]) or _longest(kinds[1]) or arriving
 
     def _close(self, connection: Connection) -> None:
         self.remove(connection)
@@ -177,6 +177,10 @@ class Acceptor:
 
     ``asyncio``'s own server has no limit: when descriptors run out, it writes thousands of log
     lines per second and leaves no time for requests.
+
+    A TLS handshake takes a millisecond of the event loop. It is begun when the client has said
+    something, and one at a time has its turn of the loop, in the order in which they came. None is
+    accepted while one waits for its turn: the backlog is served in order too.
 
     Args:
         listener: the listening socket.
@@ -199,6 +203,8 @@ class Acceptor:
         self._context = context
         self._handshake_s = handshake_s
         self._loop = asyncio.get_running_loop()
+        self._turn = asyncio.Lock()  # of the event loop, for a handshake
+        self._waiting = 0  # handshakes for their turn
         self._accepted: socket.socket | None = None  # waits for room
         self._pausing: asyncio.TimerHandle | None = None
         self._episode: asyncio.TimerHandle | None = None
@@ -221,6 +227,8 @@ class Acceptor:
         self._accept()
 
     def _accept(self) -> None:
+        if self._waiting:
+            return
         pause_s = self._take(_BATCH)
         if pause_s > 0:
             self._loop.remove_reader(self._listener)
@@ -261,12 +269,36 @@ class Acceptor:
 
     async def _connect(self, connection: Connection, accepted: socket.socket) -> None:
         tls: dict[str, Any] = {}
-        if self._context is not None:
-            tls = {"ssl": self._context(), "ssl_handshake_timeout": self._handshake_s}
         try:
+            if self._context is not None:
+                await self._greeted(accepted)
+                tls = {"ssl": self._context(), "ssl_handshake_timeout": self._handshake_s}
             await self._loop.connect_accepted_socket(lambda: connection, accepted, **tls)
-        except OSError:  # the client's TLS handshake failed
+        except OSError:  # the client's TLS handshake failed, or it never began
             self._connections.remove(connection)
+
+    async def _greeted(self, accepted: socket.socket) -> None:
+        """Wait until a client has said something, and then for a turn of the event loop.
+
+        Raises:
+            TimeoutError: when it says nothing. The connection is closed.
+        """
+        said = asyncio.Event()
+        self._loop.add_reader(accepted, said.set)
+        try:
+            async with asyncio.timeout(self._handshake_s):
+                await said.wait()
+            self._loop.remove_reader(accepted)
+            self._waiting += 1
+            try:
+                async with self._turn:
+                    await asyncio.sleep(0)
+            finally:
+                self._waiting -= 1
+        except BaseException:
+            self._loop.remove_reader(accepted)
+            accepted.close()
+            raise
 
     def _note_shortage(self, error: OSError) -> None:
         """Log the start of an episode of this error, and later its end."""

@@ -18,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from service.values import (
+    Abandoned,
     ImageJob,
     InstantJob,
     Localization,
@@ -53,10 +54,6 @@ from visloc.timing import summed
 from visloc.types import InstantAnswer
 
 logger = logging.getLogger(__name__)
-
-
-class Abandoned(Exception):
-    """The caller no longer waits for the task."""
 
 
 class Vision:

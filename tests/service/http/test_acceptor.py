@@ -288,6 +288,24 @@ def test_a_new_connection_has_time_to_send_a_request() -> None:
     assert connections.make_room() == float("inf")
 
 
+def test_who_was_served_is_not_closed_because_new_ones_have_their_time_yet() -> None:
+    served, *new = [Talk() for _ in range(3)]
+    connections = OpenConnections(3)
+    connections.add(served)
+    connections.note(served, in_use=True)
+    connections.note(served, in_use=False)
+    time.sleep(0.15)
+    for talk in new:
+        connections.add(talk)
+
+    wait_s = connections.make_room()
+    assert 0 < wait_s < 1
+    assert not served.was_closed
+    time.sleep(wait_s)
+    assert connections.make_room() == 0
+    assert new[0].was_closed
+
+
 def test_a_small_limit_has_a_place_for_health_too() -> None:
     connections = OpenConnections(3)
     for _ in range(2):

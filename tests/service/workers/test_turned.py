@@ -12,8 +12,8 @@ import pytest
 
 from mapping.build.build import build_map
 from mapping.build.settings import BuildSettings
-from service.values import MapFolder, WorkerSettings, photo_job
-from service.workers.vision import Abandoned, Vision
+from service.values import Abandoned, MapFolder, WorkerSettings, photo_job
+from service.workers.vision import Vision
 from tests.turning import png, turned_camera, turned_pixels, turned_pose
 from visloc.archive import MapStore
 from visloc.evaluation import pose_error

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from service.values import (
+    Abandoned,
     ImageJob,
     MapFolder,
     RigJob,
@@ -22,7 +23,7 @@ from service.workers import open_maps as opening
 from service.workers import vision
 from service.workers.open_maps import OpenMaps
 from service.workers.photos import DecodedQuery
-from service.workers.vision import Abandoned, Vision
+from service.workers.vision import Vision
 from visloc.archive import MapStore
 from visloc.errors import Conflict, InvalidInput, WeightsError
 from visloc.features import GlobalDescriptor, make_global_descriptor
