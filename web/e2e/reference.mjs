@@ -7,7 +7,9 @@ export default async function ({ browser, url }) {
   await route.locator(".opblock-summary-control").click();
   await route.getByRole("button", { name: "Try it out" }).click();
   await route.getByRole("button", { name: "Execute" }).click();
-  const answer = await route.locator(".live-responses-table tbody .response-col_status").innerText();
+  const answer = await route
+    .locator(".live-responses-table tbody .response-col_status")
+    .innerText();
   const tried = await docs.page.locator("#api").innerText();
 
   const redoc = await openWatched(browser, `${url}/redoc`);
