@@ -63,7 +63,7 @@ def blocks(page: Path, language: str) -> list[str]:
 def shell_lines(page: Path) -> list[str]:
     """The commands of a page that a reader pastes after ``make install``, each on one line."""
     known = ("make", "curl", ".venv/bin/")
-    commands = (c for c in commands_of(page) if not (c.is_python or c.is_inline))
+    commands = (c for c in commands_of(page) if not (c.is_python or c.is_inline or c.saved_as))
     return [command.text for command in commands if command.text.startswith(known)]
 
 
