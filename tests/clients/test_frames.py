@@ -83,6 +83,9 @@ def test_the_matrices_are_those_that_both_clients_agree_on(
 
     np.testing.assert_allclose(matrix.T.ravel(), truth["camera_matrix"][axes], atol=1e-8)
     np.testing.assert_allclose(moved.T.ravel(), truth["session_from_map"][axes], atol=1e-6)
+    if axes is Axes.OPENGL:
+        between = blended(session_from_camera, moved, 0.3)
+        np.testing.assert_allclose(between.T.ravel(), truth["blended"], atol=1e-6)
 
 
 @pytest.mark.parametrize("axes", Axes)

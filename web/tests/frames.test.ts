@@ -1,5 +1,6 @@
 import { describe, expect, test } from "vitest";
 import {
+  blended,
   cameraMatrix,
   ServiceError,
   sessionFromMap,
@@ -45,6 +46,25 @@ describe.each(AXES)("in the axes of %s", (axes) => {
       expect(value).toBeCloseTo(seen[i]!, 12),
     );
   });
+});
+
+test.each(truths)("what lies between is as in Python: $translation", (truth) => {
+  const [old, next] = [truth.session_from_camera, truth.session_from_map.opengl];
+  expectClose(blended(old, next, 0.3), truth.blended);
+  expectClose(blended(old, next, 0), old);
+  expectClose(blended(old, next, 1), next);
+  expectClose(blended(old, old, 0.5), old);
+});
+
+test("half a turn, and nearly none, are blended", () => {
+  const turned = (angle: number): Matrix4 => [
+    ...[Math.cos(angle), Math.sin(angle), 0, 0, -Math.sin(angle), Math.cos(angle), 0, 0],
+    ...[0, 0, 1, 0, 0, 0, 0, 1],
+  ];
+  for (const angle of [1e-9, 0.1, 3, Math.PI - 1e-9, -2]) {
+    expectClose(blended(turned(0), turned(angle), 0.25), turned(angle / 4));
+    expectClose(blended(turned(3), turned(3 + angle), 0.25), turned(3 + angle / 4));
+  }
 });
 
 test("a quaternion counts by its direction", () => {

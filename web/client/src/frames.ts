@@ -28,27 +28,12 @@ const TOLERANCE = 1e-4;
 /** Where the camera is in the map: map_from_camera. With `unity`, these are the map's axes too. */
 export function cameraMatrix(pose: Posed, axes: Axes = "opencv"): Matrix4 {
   const { rotation_wxyz, translation } = pose.cam_from_world;
-  // Upright: the camera's y and z turn. Mirrored: z of points in the map, and of the camera.
-  const [cameraY, cameraZ, mapZ] =
-    axes === "opencv" ? [1, 1, 1] : axes === "opengl" ? [-1, -1, 1] : [-1, 1, -1];
-  const norm = Math.hypot(...rotation_wxyz);
-  const [w, x, y, z] = rotation_wxyz.map((part) => part / norm) as [number, number, number, number];
-  // Rows of cam_from_world's rotation are columns of its inverse's.
-  const right = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)];
-  const down = [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)];
-  const forward = [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)];
-  const centre = [0, 1, 2].map(
-    (i) => -(right[i]! * translation[0] + down[i]! * translation[1] + forward[i]! * translation[2]),
-  );
-  const column = ([a, b, c]: number[], sign: number, last: number): number[] => [
-    ...[sign * a!, sign * b!, sign * mapZ! * c!, last],
-  ];
-  return [
-    ...column(right, 1, 0),
-    ...column(down, cameraY!, 0),
-    ...column(forward, cameraZ!, 0),
-    ...column(centre, 1, 1),
-  ];
+  const matrix = rigidInverse(rigid(rotation_wxyz, translation));
+  if (axes === "opencv") return matrix;
+  const upright = matrix.map((value, i) => (i >= 4 && i < 12 ? -value : value));
+  if (axes === "opengl") return upright;
+  // Unity's frames mirror z: of points in the map (the third row) and in the camera (column).
+  return upright.map((value, i) => ((i % 4 === 2) !== (i >= 8 && i < 12) ? -value : value));
 }
 
 /**
@@ -68,8 +53,65 @@ export function sessionFromMap(
   return multiply(session, rigidInverse(cameraMatrix(pose, axes)));
 }
 
+/**
+ * A rigid transform between two: positions linearly, rotations along the shortest way.
+ *
+ * With `share = oldVariance / (oldVariance + newVariance)` this is the best estimate of a transform
+ * that does not change, such as sessionFromMap. `share`, of the new one, is 0 to 1.
+ */
+export function blended(
+  before: ArrayLike<number>,
+  after: ArrayLike<number>,
+  share: number,
+): Matrix4 {
+  const [old, next] = [Array.from(before), Array.from(after)];
+  [old, next].forEach(checkRigid);
+  const p = quaternionOf(old);
+  let q = quaternionOf(next);
+  let cosine = p.reduce((sum, part, i) => sum + part * q[i]!, 0);
+  // A quaternion and its negative are one rotation; this is the nearer of both.
+  if (cosine < 0) [q, cosine] = [q.map((part) => -part), -cosine];
+  const angle = Math.acos(Math.min(1, cosine));
+  // Spherical; for angles too small to divide by, linear is the same.
+  const [a, b] =
+    angle < 1e-6
+      ? [1 - share, share]
+      : [Math.sin((1 - share) * angle), Math.sin(share * angle)].map((x) => x / Math.sin(angle));
+  const between = p.map((part, i) => a! * part + b! * q[i]!);
+  const at = [12, 13, 14].map((i) => (1 - share) * old[i]! + share * next[i]!);
+  return rigid(between, at);
+}
+
+/** The transform of a quaternion w, x, y, z of any length, and a translation. */
+function rigid(quaternion: ArrayLike<number>, translation: ArrayLike<number>): Matrix4 {
+  const parts = Array.from(quaternion);
+  const norm = Math.hypot(...parts);
+  const [w, x, y, z] = parts.map((part) => part / norm) as [number, number, number, number];
+  return [
+    ...[1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y), 0],
+    ...[2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x), 0],
+    ...[2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y), 0],
+    ...[translation[0]!, translation[1]!, translation[2]!, 1],
+  ];
+}
+
+/** Of unit length: w, x, y, z of a matrix's rotation. */
+function quaternionOf(m: number[]): number[] {
+  const [xx, yy, zz] = [m[0]!, m[5]!, m[10]!];
+  // Four times the products of each component with all; the largest is the safest to divide by.
+  const products = [
+    [1 + xx + yy + zz, m[6]! - m[9]!, m[8]! - m[2]!, m[1]! - m[4]!],
+    [m[6]! - m[9]!, 1 + xx - yy - zz, m[1]! + m[4]!, m[8]! + m[2]!],
+    [m[8]! - m[2]!, m[1]! + m[4]!, 1 - xx + yy - zz, m[6]! + m[9]!],
+    [m[1]! - m[4]!, m[8]! + m[2]!, m[6]! + m[9]!, 1 - xx - yy + zz],
+  ];
+  const best = products.reduce((a, b, i) => (b[i]! > a[products.indexOf(a)]! ? b : a));
+  const norm = Math.hypot(...best);
+  return best.map((part) => part / norm);
+}
+
 /** The product a b. */
-export function multiply(a: ArrayLike<number>, b: ArrayLike<number>): Matrix4 {
+function multiply(a: ArrayLike<number>, b: ArrayLike<number>): Matrix4 {
   return Array.from({ length: 16 }, (_, at) => {
     const row = at % 4;
     const column = at - row;
@@ -77,8 +119,8 @@ export function multiply(a: ArrayLike<number>, b: ArrayLike<number>): Matrix4 {
   });
 }
 
-/** The inverse of a rotation and a translation; of Unity's frames too. */
-export function rigidInverse(m: ArrayLike<number>): Matrix4 {
+/** The inverse of a rotation and a translation. */
+function rigidInverse(m: ArrayLike<number>): Matrix4 {
   const turned = [0, 1, 2].map((column) => [m[column]!, m[4 + column]!, m[8 + column]!, 0]);
   const moved = [0, 1, 2].map(
     (i) => -(m[4 * i]! * m[12]! + m[4 * i + 1]! * m[13]! + m[4 * i + 2]! * m[14]!),
@@ -98,13 +140,12 @@ function checkRigid(m: number[]): void {
     [m[15]!, 1],
     [determinant, 1],
   ];
-  const rigid =
+  const isRigid =
     m.length === 16 &&
     m.every(Number.isFinite) &&
     parts.every(([is, shall]) => Math.abs(is - shall) < TOLERANCE);
-  if (rigid) return;
+  if (isRigid) return;
   throw ownError("frames.not_rigid", "No rigid transform", "the matrix is no rigid transform", {
-    field: "sessionFromCamera",
     expected: "16 numbers, column by column: a rotation and a translation",
     got: m.slice(0, 16).join(", "),
   });

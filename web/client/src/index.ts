@@ -1,6 +1,13 @@
 export { connect, type Client, type Settings } from "./client.js";
 export { ownError, ServiceError, type Problem } from "./errors.js";
-export { cameraMatrix, sessionFromMap, type Axes, type Matrix4, type Posed } from "./frames.js";
+export {
+  blended,
+  cameraMatrix,
+  sessionFromMap,
+  type Axes,
+  type Matrix4,
+  type Posed,
+} from "./frames.js";
 export { parsePoints, PointsError, ROW_BYTES, type PointBlock } from "./points.js";
 export {
   localizeForm,
