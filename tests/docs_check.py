@@ -55,6 +55,7 @@ SMALLER = {
     "--max-bytes 200MB": "--max-bytes 1500KB",
     "--max-landmarks 100000": "--max-landmarks 3000",
 }
+ASKS_NO_SERVER = ("evaluate", "submit")  # of the commands of `localize`
 COMMAND_LIMIT_S = 400
 READY_WITHIN_S = 60
 
@@ -84,8 +85,8 @@ class Command:
 
     @property
     def words(self) -> list[str]:
-        """Without variables before it, and without what a pipe leads into."""
-        words = shlex.split(self.text.partition(" | ")[0].partition(" && ")[0])
+        """Without variables before it, and without what a pipe or a file takes."""
+        words = shlex.split(re.split(r" (?:\||&&|>) ", self.text)[0])
         while re.match(r"[A-Z_]+=", words[0]):
             words.pop(0)
         words[0] = words[0].removeprefix(".venv/bin/")
@@ -366,7 +367,7 @@ class Desk:
         if not command.is_python and command.words[0] == "visloc-service":
             self.serve(command.words[1:])
             return
-        if not self.http and re.search(r"\blocalize\b|127\.0\.0\.1", command.text):
+        if not self.http and (asks_server(command) or "127.0.0.1:" in command.text):
             self.serve(["--maps-dir", "maps"])
         text = command.text.replace("127.0.0.1:8000", self.http)
         text = text.replace("127.0.0.1:50051", self.grpc)
@@ -382,7 +383,7 @@ class Desk:
     def added(self, command: Command) -> str:
         """Return the flags of a reader whose ports, and maps of that name, are taken."""
         words = command.words
-        if words[0] == "localize" and "--server" not in words:
+        if asks_server(command) and "--server" not in words:
             return f" --server http://{self.http}"
         if words[0] == "curl":
             return " --silent --show-error"
@@ -423,6 +424,14 @@ class Desk:
             self.service.terminate()
             self.service.wait()
         self.service, self.http, self.grpc = None, "", ""
+
+
+def asks_server(command: Command) -> bool:
+    """Return whether it is a `localize` command that asks a service."""
+    if command.is_python or command.saved_as:
+        return False
+    program, *arguments = command.words
+    return program == "localize" and arguments[0] not in ASKS_NO_SERVER
 
 
 def environment() -> dict[str, str]:

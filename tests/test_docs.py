@@ -29,7 +29,7 @@ from mapping.maps.export import export_map
 from service.errors import STATUSES
 from service.settings import CONFIG_VARIABLE, PREFIX, ServiceSettings, read_settings
 from tests import docs_check, error_docs, option_docs
-from tests.docs_check import commands_of
+from tests.docs_check import ASKS_NO_SERVER, commands_of
 from visloc.archive import MapStore
 from visloc.errors import InvalidInput, catalogue
 from visloc.geometry import Camera, Pose
@@ -47,7 +47,6 @@ from visloc_api.words.status import Problem
 
 ROOT = Path(__file__).resolve().parents[1]
 FIRST_STEPS, API = ROOT / "docs" / "first-steps.md", ROOT / "docs" / "api.md"
-ASKS_NO_SERVER = ("evaluate", "submit")
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
 COMMANDS = Path(sys.executable).parent
 

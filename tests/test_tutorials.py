@@ -17,14 +17,16 @@ from visloc.kapture import read_dataset
 
 # How many commands run; your-room takes a minute more, in tests/mapping/capture/test_tutorial.py.
 TUTORIALS = {
-    "building": 7,
+    "building": 8,
     "compare-features": 8,
     "for-others": 12,
-    "from-hloc": 6,
+    "from-hloc": 5,
     "robot": 6,
     "your-app": 4,
 }
 WITHOUT_COMMANDS = "from-hosted"
+# They make maps.
+SLOW = ("building", "compare-features", "from-hloc", "robot")
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +48,10 @@ def test_every_tutorial_is_run() -> None:
     assert pages == {*TUTORIALS, WITHOUT_COMMANDS, "your-room"}
 
 
-@pytest.mark.parametrize("name", TUTORIALS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in TUTORIALS],
+)
 def test_the_commands_of_a_tutorial_run(name: str, demo: Path, tmp_path: Path) -> None:
     commands = docs_check.commands_of(docs_check.ROOT / "docs" / "tutorials" / f"{name}.md")
     if any(command.text.startswith("npm ") for command in commands):
