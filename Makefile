@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 # What is made last of it.
 PAGE := visloc_web/built/report/report.js
-PAGE_SOURCES := $(shell find web/src web/*.html web/*.json web/*.ts -type f)
+PAGE_SOURCES := $(shell find web/src web/client/src web/*.html web/*.json web/client/*.json web/*.ts -type f)
 
 .DEFAULT_GOAL := help
 # Vite needs this much; without it the service has no page, and says so.
@@ -176,4 +176,4 @@ serve: install ## serve the maps in maps/ on 127.0.0.1:8000 (HTTP) and :50051 (g
 	$(BIN)/python -m service --maps-dir maps
 
 clean: ## remove what make made
-	rm -rf $(VENV) .site .site-links .sbom .demo .bench .change .trust web/node_modules visloc_web/built
+	rm -rf $(VENV) .site .site-links .sbom .demo .bench .change .trust web/node_modules web/client/dist visloc_web/built

@@ -5,8 +5,9 @@
 Runs in a scratch folder: the demo first, then page after page in the order in which the commands
 are printed, each page with its own copy of the maps and its own server on the loopback interface.
 ``RULES`` says which commands are only parsed, and which need what is not here; every other command
-runs. A line of a shell block that starts with no known program is an error, so blocks that hold no
-commands name their language (```text).
+runs. A block of JavaScript is saved in the file that its first line names, as its reader does. A
+line of a shell block that starts with no known program is an error, so blocks that hold no commands
+name their language (```text).
 """
 
 from __future__ import annotations
@@ -37,6 +38,8 @@ from samples.film import film_walk
 from samples.render import render_photo
 from samples.scene import make_room
 from samples.trajectories import mapping_trajectory, stereo_rig
+from tests.rosbags_made import write_bag
+from visloc.kapture import read_dataset
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = (
@@ -52,6 +55,7 @@ SMALLER = {
     "--max-bytes 200MB": "--max-bytes 1500KB",
     "--max-landmarks 100000": "--max-landmarks 3000",
 }
+ASKS_NO_SERVER = ("evaluate", "submit")  # of the commands of `localize`
 COMMAND_LIMIT_S = 400
 READY_WITHIN_S = 60
 
@@ -69,6 +73,7 @@ class Command:
         text: on one line, without comments; of Python all lines of the block.
         is_python: whether it is a block of Python.
         is_inline: whether it stands in a sentence, as an example of usage; never run.
+        saved_as: the file that a reader writes it to, of JavaScript; empty for others.
     """
 
     page: str
@@ -76,11 +81,12 @@ class Command:
     text: str
     is_python: bool = False
     is_inline: bool = False
+    saved_as: str = ""
 
     @property
     def words(self) -> list[str]:
-        """Without variables before it, and without what a pipe leads into."""
-        words = shlex.split(self.text.partition(" | ")[0].partition(" && ")[0])
+        """Without variables before it, and without what a pipe or a file takes."""
+        words = shlex.split(re.split(r" (?:\||&&|>) ", self.text)[0])
         while re.match(r"[A-Z_]+=", words[0]):
             words.pop(0)
         words[0] = words[0].removeprefix(".venv/bin/")
@@ -96,6 +102,8 @@ def commands_of(page: Path) -> list[Command]:
         line = text.count("\n", 0, block.start()) + 2
         if language == "python":
             found.append(Command(name, line, body, is_python=True))
+        elif language == "js":
+            found.append(Command(name, line, body, saved_as=_first_comment(body)))
         elif language in ("", "sh", "bash"):
             for printed in body.replace("\\\n", " ").splitlines():
                 command = re.sub(r"(^|\s+)#.*", "", printed).strip()
@@ -106,6 +114,13 @@ def commands_of(page: Path) -> list[Command]:
         line = prose.count("\n", 0, span.start()) + 1
         found.append(Command(name, line, span[1].replace("\n", " "), is_inline=True))
     return found
+
+
+def _first_comment(body: str) -> str:
+    """Return the relative path of a JavaScript file that its first line names."""
+    named = re.match(r"// ([\w/-]+\.mjs)\n", body)
+    assert named is not None, f"a block of JavaScript names no file: {body[:60]}"
+    return named[1]
 
 
 # Judging
@@ -142,6 +157,7 @@ RULES = (
     Rule(Tier.ELSEWHERE, r"", r"(TAG=\d+ )?docker ", "a Docker daemon; tests/test_deploy.py"),
     Rule(Tier.ELSEWHERE, r"", r"kubectl ", "a cluster; tests/test_deploy_kubernetes.py"),
     Rule(Tier.ELSEWHERE, r"", r"export VISLOC_API_KEY", "a key of the reader's own"),
+    Rule(Tier.ELSEWHERE, r"", r"python -m http\.server", "would not end; test_web_overlay.py"),
     Rule(Tier.ELSEWHERE, r"", r"pip install", "a package index; tests/examples/test_plugin.py"),
     Rule(Tier.ELSEWHERE, r"", r"curl .*//maps\.example\.org", "a host of that name"),
     Rule(Tier.PARSED, r"", r"([A-Z]+=\S+ |[A-Z]+=\".*\" )?make ", "a target of its own"),
@@ -149,6 +165,7 @@ RULES = (
     Rule(Tier.PARSED, r"ar-and", r"(mapping import|localize bag)", "needs bags; test_rosbag.py"),
     Rule(Tier.PARSED, r"map-sets", r"mapping (set|split)", _PLACES),
     Rule(Tier.PARSED, r"mapping\.md", r"mapping capture", "the tutorial runs it"),
+    Rule(Tier.PARSED, r"your-app", r"visloc-service .*cors", "test_web_overlay.py"),
     Rule(Tier.PARSED, r"your-room", r".* PHOTOS ", "minutes more; tests/mapping/capture"),
     Rule(
         Tier.PARSED,
@@ -190,7 +207,7 @@ RULES = (
 )
 PROGRAMS = (
     *("mapping", "localize", "visloc-service", "python", "make"),
-    *("curl", "cp", "sed", "openssl", "printf"),
+    *("curl", "cp", "sed", "openssl", "printf", "node", "npm"),
 )
 
 
@@ -200,7 +217,7 @@ def judged(command: Command) -> Rule:
     Raises:
         ValueError: it begins with no known program.
     """
-    if command.is_python:
+    if command.is_python or command.saved_as:
         return Rule(Tier.RUN, "", "")
     if command.is_inline:
         return Rule(Tier.PARSED, "", "", "usage in a sentence")
@@ -228,6 +245,8 @@ def parse(command: Command) -> None:
     if command.is_python:
         compile(command.text, f"{command.page}:{command.line}", "exec")
         return
+    if command.saved_as:
+        return  # node tells when it runs
     program, *arguments = command.words
     if program == "make":
         _parse_make(command)
@@ -340,10 +359,15 @@ class Desk:
         Raises:
             CommandFailed: it failed, took too long, or localized nothing.
         """
+        if command.saved_as:
+            file = self.folder / command.saved_as
+            file.parent.mkdir(exist_ok=True)
+            file.write_text(command.text.replace("127.0.0.1:8000", self.http))
+            return
         if not command.is_python and command.words[0] == "visloc-service":
             self.serve(command.words[1:])
             return
-        if not self.http and re.search(r"\blocalize\b|127\.0\.0\.1", command.text):
+        if not self.http and (asks_server(command) or "127.0.0.1:" in command.text):
             self.serve(["--maps-dir", "maps"])
         text = command.text.replace("127.0.0.1:8000", self.http)
         text = text.replace("127.0.0.1:50051", self.grpc)
@@ -359,7 +383,7 @@ class Desk:
     def added(self, command: Command) -> str:
         """Return the flags of a reader whose ports, and maps of that name, are taken."""
         words = command.words
-        if words[0] == "localize":
+        if asks_server(command) and "--server" not in words:
             return f" --server http://{self.http}"
         if words[0] == "curl":
             return " --silent --show-error"
@@ -388,7 +412,7 @@ class Desk:
                 stderr=file,
             )
         until = time.monotonic() + READY_WITHIN_S
-        while not (found := re.search(r"ready: http://(\S+) grpc://(\S+),", log.read_text())):
+        while not (found := re.search(r"ready: https?://(\S+) grpcs?://(\S+),", log.read_text())):
             if time.monotonic() > until or self.service.poll() is not None:
                 raise CommandFailed(log.read_text())
             time.sleep(0.2)
@@ -400,6 +424,14 @@ class Desk:
             self.service.terminate()
             self.service.wait()
         self.service, self.http, self.grpc = None, "", ""
+
+
+def asks_server(command: Command) -> bool:
+    """Return whether it is a `localize` command that asks a service."""
+    if command.is_python or command.saved_as:
+        return False
+    program, *arguments = command.words
+    return program == "localize" and arguments[0] not in ASKS_NO_SERVER
 
 
 def environment() -> dict[str, str]:
@@ -442,6 +474,7 @@ def prepare(base: Path) -> None:
     call(base, ["mapping", "build", "small/mapping", "--map", "kitchen"])
     call(base, ["mapping", "build", "small/query", "--map", "hall", "--method", "sfm"])
     film_ten_seconds(base)
+    write_bag(base / "walk.bag", read_dataset(base / "small" / "mapping"), ros1=True)
 
 
 def film_ten_seconds(folder: Path) -> None:
@@ -479,13 +512,14 @@ def desk_of(base: Path, page: str) -> Desk:
         "PHOTOS": base / "small" / "query" / "sensors" / "records_data" / "query" / "left",
         "examples": ROOT / "examples",
         "benchmarks": ROOT / "benchmarks",
+        "web": ROOT / "web",
     }
     if DATA.is_dir():
         links |= {path.name: path for path in DATA.iterdir() if path.is_dir()}
         links["lund_door"] = DATA / "import_samples" / "lund_door"
     for name, target in links.items():
         (folder / name).symlink_to(target)
-    for name in ("walk.mp4", "photo.jpg"):
+    for name in ("walk.mp4", "photo.jpg", "walk.bag"):
         shutil.copy(base / name, folder)
     recording = folder / "RECORDING"
     recording.mkdir()

@@ -29,7 +29,7 @@ from mapping.maps.export import export_map
 from service.errors import STATUSES
 from service.settings import CONFIG_VARIABLE, PREFIX, ServiceSettings, read_settings
 from tests import docs_check, error_docs, option_docs
-from tests.docs_check import commands_of
+from tests.docs_check import ASKS_NO_SERVER, commands_of
 from visloc.archive import MapStore
 from visloc.errors import InvalidInput, catalogue
 from visloc.geometry import Camera, Pose
@@ -47,7 +47,6 @@ from visloc_api.words.status import Problem
 
 ROOT = Path(__file__).resolve().parents[1]
 FIRST_STEPS, API = ROOT / "docs" / "first-steps.md", ROOT / "docs" / "api.md"
-ASKS_NO_SERVER = ("evaluate", "submit")
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
 COMMANDS = Path(sys.executable).parent
 
@@ -63,7 +62,7 @@ def blocks(page: Path, language: str) -> list[str]:
 def shell_lines(page: Path) -> list[str]:
     """The commands of a page that a reader pastes after ``make install``, each on one line."""
     known = ("make", "curl", ".venv/bin/")
-    commands = (c for c in commands_of(page) if not (c.is_python or c.is_inline))
+    commands = (c for c in commands_of(page) if not (c.is_python or c.is_inline or c.saved_as))
     return [command.text for command in commands if command.text.startswith(known)]
 
 

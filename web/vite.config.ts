@@ -18,6 +18,7 @@ const redocForBrowsers: Plugin = {
 export default defineConfig({
   base: "./",
   plugins: [redocForBrowsers],
+  resolve: { tsconfigPaths: true },
   build: {
     outDir: "../visloc_web/built/page",
     emptyOutDir: true,

@@ -2,6 +2,7 @@
 import { defineConfig } from "vite";
 
 export default defineConfig({
+  resolve: { tsconfigPaths: true },
   build: {
     outDir: "../visloc_web/built/report",
     emptyOutDir: true,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -62,6 +64,28 @@ def test_the_matrix_shows_a_point_of_the_map_where_the_photo_shows_it(
 
     shown = seen_by(camera_from_map, in_frame_of(axes, point), axes)
     np.testing.assert_allclose(shown, np.array(beheld[:2]) / beheld[2], atol=1e-6)
+
+
+# Matrices by columns. web/tests/frames.test.ts holds the TypeScript client to the same numbers.
+TRUTHS = json.loads(Path(__file__).with_name("frames.json").read_bytes())
+
+
+@pytest.mark.parametrize("axes", Axes)
+@pytest.mark.parametrize("truth", TRUTHS)
+def test_the_matrices_are_those_that_both_clients_agree_on(
+    axes: Axes, truth: dict[str, Any]
+) -> None:
+    pose = Pose.from_quaternion(truth["rotation_wxyz"], truth["translation"])
+    session_from_camera = np.reshape(truth["session_from_camera"], (4, 4)).T
+
+    matrix = camera_matrix(pose, axes)
+    moved = session_from_map(session_from_camera, pose, axes)
+
+    np.testing.assert_allclose(matrix.T.ravel(), truth["camera_matrix"][axes], atol=1e-8)
+    np.testing.assert_allclose(moved.T.ravel(), truth["session_from_map"][axes], atol=1e-6)
+    if axes is Axes.OPENGL:
+        between = blended(session_from_camera, moved, 0.3)
+        np.testing.assert_allclose(between.T.ravel(), truth["blended"], atol=1e-6)
 
 
 @pytest.mark.parametrize("axes", Axes)

@@ -10,9 +10,7 @@ import shutil
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -22,6 +20,7 @@ import numpy as np
 import pytest
 
 from mapping.cli.report import write_report
+from tests.serving import ENVIRONMENT, serving
 from visloc.archive import MapStore
 from visloc.evaluation import pose_error
 from visloc.geometry import Camera, Pose
@@ -29,8 +28,6 @@ from visloc.options import Solver
 
 ROOT = Path(__file__).resolve().parents[2]
 BUILT = ROOT / "visloc_web" / "built"
-ENVIRONMENT = {name: value for name, value in os.environ.items() if "VISLOC" not in name}
-READY = re.compile(r"ready: (http://127\.0\.0\.1:\d+) ")
 LONGEST_S = 90
 
 
@@ -92,26 +89,6 @@ class Browser:
         answer = json.loads(line)
         assert "failed" not in answer, answer["failed"]
         return dict(answer["seen"])
-
-
-@contextmanager
-def serving(maps_dir: Path, log: Path) -> Iterator[str]:
-    """Run the service; its URL."""
-    command = [sys.executable, "-m", "service", "--maps-dir", str(maps_dir)]
-    ports = ["--http-port=0", "--grpc-port=0", "--threads-per-worker=1"]
-    with (
-        log.open("wb") as stderr,
-        subprocess.Popen([*command, *ports], stderr=stderr, env=ENVIRONMENT) as process,
-    ):
-        try:
-            deadline = time.monotonic() + 60
-            while (ready := READY.search(log.read_text())) is None:
-                assert process.poll() is None, log.read_text()
-                assert time.monotonic() < deadline, log.read_text()
-                time.sleep(0.05)
-            yield ready[1]
-        finally:
-            process.kill()
 
 
 @pytest.fixture(scope="module")

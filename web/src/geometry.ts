@@ -1,7 +1,7 @@
 // Small linear algebra of poses and views: pure functions, no three.js.
 // Conventions as in docs/conventions.md: cameras look along +z, +y is down in the image;
 // pixels as in COLMAP. Matrices are 3 x 3, row by row.
-import type { Camera, MapImage, Quaternion, Vector3 } from "./api";
+import type { Camera, MapImage, Quaternion, Vector3 } from "visloc-client";
 
 export type Matrix3 = [number, number, number, number, number, number, number, number, number];
 

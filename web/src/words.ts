@@ -1,5 +1,5 @@
 // Numbers as people read them.
-import type { LocalizeResponse } from "./api";
+import { mapRef, type LocalizeResponse } from "visloc-client";
 
 const WHOLE = new Intl.NumberFormat("en", { maximumFractionDigits: 0 });
 
@@ -53,3 +53,8 @@ export const CAMERA_SOURCES: Readonly<Record<LocalizeResponse["camera"]["source"
   estimated: "focal length found together with the pose",
   guess: "guessed: the photo does not tell its focal length",
 };
+
+/** As people name a map: with the version only where that is not the current one. */
+export function shortRef(map: { id: string; version: string; current: boolean }): string {
+  return map.current ? map.id : mapRef(map);
+}

@@ -1,6 +1,6 @@
 import { describe, expect, test } from "vitest";
 import conventions from "../../docs/conventions.md?raw";
-import { cameraText, ServiceError } from "../src/api";
+import { cameraText, ServiceError } from "visloc-client";
 import { CAMERA_MODELS, cameraFaults, cameraOf, typedCamera } from "../src/page/camera_models";
 
 const TYPED = {

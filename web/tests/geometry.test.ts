@@ -1,5 +1,5 @@
 import { describe, expect, test } from "vitest";
-import type { Camera, Quaternion, Vector3 } from "../src/api";
+import type { Camera, Quaternion, Vector3 } from "visloc-client";
 import {
   REACH_95,
   add,

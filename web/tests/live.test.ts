@@ -1,6 +1,6 @@
 // The logic of live mode, without a camera and without a page.
 import { describe, expect, it, vi } from "vitest";
-import { ownError, ServiceError, type LocalizeResponse, type Problem } from "../src/api";
+import { ownError, ServiceError, type LocalizeResponse, type Problem } from "visloc-client";
 import {
   FocalEstimates,
   cameraOfFieldOfView,

@@ -1,6 +1,6 @@
 // A walk while cameras, maps and the page come and go: live mode without a camera and a page.
 import { afterEach, beforeEach, describe, expect, it, vi } from "vitest";
-import { connect, ownError, type LocalizeResponse, type MapInfo } from "../src/api";
+import { connect, ownError, type LocalizeResponse, type MapInfo } from "visloc-client";
 import { chooseCamera } from "../src/page/live_camera";
 import { pause, type Frame } from "../src/page/live_loop";
 import { LiveSession, type SessionParts } from "../src/page/live_session";
@@ -171,7 +171,7 @@ describe("a walk", () => {
     const answer = () => new Response("{}", { status: 429, headers: { "Retry-After": after } });
     const fetched = vi.fn(() => Promise.resolve(answer()));
     vi.stubGlobal("fetch", fetched);
-    const service = connect(new URL("https://maps.example.org/"), () => null);
+    const service = connect("https://maps.example.org/");
     const call = { map: "kitchen", image: FRAME.jpeg, name: "", camera: null, options: {} };
     const { session, seen } = walk({ localize: (_, __, signal) => service.localize(call, signal) });
     await session.start();

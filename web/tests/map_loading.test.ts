@@ -1,7 +1,13 @@
 import { afterEach, beforeEach, describe, expect, test, vi } from "vitest";
-import { ownError, ServiceError, type MapImages, type MapInfo, type Service } from "../src/api";
+import {
+  ownError,
+  parsePoints,
+  ServiceError,
+  type Client,
+  type MapImages,
+  type MapInfo,
+} from "visloc-client";
 import { loadMap, movedBlock, shownTiles } from "../src/page/map_loading";
-import { parsePoints } from "../src/points";
 import { patiently } from "../src/page/patience";
 import type { Viewer } from "../src/viewer/types";
 
@@ -30,7 +36,7 @@ function busy(status: number, wait: number | null): ServiceError {
 }
 
 /** What the viewer and the page were told, in order. */
-function load(service: Partial<Service>, map = MAP) {
+function load(service: Partial<Client>, map = MAP) {
   const told: string[] = [];
   const viewer = {
     reset: ({ up }: { up: number[] }) => told.push(`reset ${up.map(Math.round).join()}`),
@@ -38,12 +44,12 @@ function load(service: Partial<Service>, map = MAP) {
     setMappingCameras: (images: unknown[]) => told.push(`cameras ${images.length}`),
   } as unknown as Viewer;
   const given = new AbortController();
-  const whole: Partial<Service> = {
+  const whole: Partial<Client> = {
     images: async () => structuredClone(IMAGES),
-    points: async () => points(3),
+    points: async () => parsePoints(points(3)),
     ...service,
   };
-  const done = loadMap(map, patiently(whole as Service), viewer, {
+  const done = loadMap(map, patiently(whole as Client), viewer, {
     signal: given.signal,
     onReset: () => told.push("forgotten"),
     onBlock: () => undefined,
@@ -97,7 +103,7 @@ describe("a map", () => {
     const asked = vi.fn(async () => {
       const failure = failures.shift();
       if (failure !== undefined) throw failure;
-      return points(3);
+      return parsePoints(points(3));
     });
     const { done, told } = load({ points: asked });
     await vi.advanceTimersByTimeAsync(1_900);
@@ -146,7 +152,7 @@ describe("a set", () => {
     const set = { ...MAP, id: "house", kind: "set", landmarks: 6, images: 2 } as MapInfo;
     const { done, told } = load(
       {
-        points: async (ref) => (asked.push(ref), points(3)),
+        points: async (ref) => (asked.push(ref), parsePoints(points(3))),
       },
       { ...set, tiles: [tile, { ...tile, map: "hall" }] },
     );

@@ -5,8 +5,8 @@ import {
   type LocalizeCall,
   type LocalizeResponse,
   type MapInfo,
-  type Service,
-} from "../src/api";
+  type Client,
+} from "visloc-client";
 import { createPhotoQueue, type Entry, type Wish } from "../src/page/photo_queue";
 
 const MAP = { id: "kitchen", version: "7", current: true } as MapInfo;
@@ -36,13 +36,13 @@ function queueAt(
       inFlight -= 1;
     }
   };
-  const service = { localize } as unknown as Service;
+  const service = { localize } as unknown as Client;
   return { queue: createPhotoQueue(service, () => false, onChange), calls, seen };
 }
 
 const soon = (): Promise<void> => vi.advanceTimersByTimeAsync(50).then(() => undefined);
 const states = (entries: readonly Entry[]): string[] => entries.map(({ state }) => state);
-const names = (calls: LocalizeCall[]): string[] => calls.map(({ name }) => name);
+const names = (calls: LocalizeCall[]): (string | undefined)[] => calls.map(({ name }) => name);
 
 beforeEach(() => {
   vi.useFakeTimers();

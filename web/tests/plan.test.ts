@@ -1,5 +1,5 @@
 import { describe, expect, test } from "vitest";
-import type { Vector3 } from "../src/api";
+import type { Vector3 } from "visloc-client";
 import { apply, rotationMatrix, viewingDirection } from "../src/geometry";
 import {
   directionOf,

@@ -1,6 +1,6 @@
 import { describe, expect, test } from "vitest";
-import { PointsError, parsePoints, streamPoints, type FetchPage } from "../src/points";
-import type { PointBlock } from "../src/viewer/types";
+import { parsePoints, PointsError, type PointBlock } from "visloc-client";
+import { streamPoints, type FetchPage } from "../src/points";
 
 interface Page {
   magic?: string;
@@ -31,7 +31,7 @@ function mapOf(total: number, asked: [number, number][] = []): FetchPage {
     const sent = Math.max(0, Math.min(count, total - first));
     const body = page({ total, first, count: sent });
     for (let i = 0; i < sent; i++) new DataView(body).setFloat32(48 + 16 * i, first + i, true);
-    return body;
+    return parsePoints(body);
   };
 }
 
@@ -57,7 +57,7 @@ describe("a page of landmarks", () => {
   test.each<[string, ArrayBuffer, RegExp]>([
     ["of nothing", new ArrayBuffer(0), /0 bytes/],
     ["of another kind", page({ magic: "GIF8" }), /expected VLPT first, got 47 49 46 38/],
-    ["of a later format", page({ version: 2 }), /format 2, this page reads 1/],
+    ["of a later format", page({ version: 2 }), /format 2, this client reads 1/],
     ["cut off", page({ count: 2, bytes: 70 }), /2 landmarks take 80 bytes, but 70 came/],
     ["too long", page({ count: 2, bytes: 96 }), /but 96 came/],
     [
@@ -137,7 +137,7 @@ describe("landmarks page by page", () => {
   ])("a second page %s is refused", async (_name, second, message) => {
     const good = mapOf(30_000);
     const fetchPage: FetchPage = async (first, count) =>
-      first === 0 ? good(first, count) : page(second);
+      first === 0 ? good(first, count) : parsePoints(page(second));
     await expect(streamPoints(fetchPage, () => undefined)).rejects.toThrow(message);
   });
 });

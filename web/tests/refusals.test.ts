@@ -1,6 +1,6 @@
 import { describe, expect, test } from "vitest";
 import documentation from "../../docs/api.md?raw";
-import type { LocalizeResponse } from "../src/api";
+import type { LocalizeResponse } from "visloc-client";
 import { ADVICE, advice, outcomes, STAGES } from "../src/page/refusals";
 
 const section = documentation.split("## When there is no pose")[1]!.split("\n## ")[0]!;

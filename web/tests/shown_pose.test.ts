@@ -1,5 +1,5 @@
 import { expect, test } from "vitest";
-import type { Candidate, LocalizeResponse } from "../src/api";
+import type { Candidate, LocalizeResponse } from "visloc-client";
 import { shownPlaces } from "../src/page/shown_pose";
 
 const HALL = { id: "hall", version: "v1" };

@@ -5,7 +5,7 @@ import { tmpdir } from "node:os";
 import { join } from "node:path";
 import { describe, expect, test } from "vitest";
 import client from "../../clients/client.py?raw";
-import type { LocalizeResponse } from "../src/api";
+import type { LocalizeResponse } from "visloc-client";
 import {
   answerJson,
   curlLine,

@@ -1,5 +1,5 @@
 // The answer to a photo: a pose, or how far the photo came and what to try.
-import { mapRef, type LocalizeResponse, type PoseEstimate } from "../api";
+import { mapRef, type LocalizeResponse, type PoseEstimate } from "visloc-client";
 import { button, element, facts } from "../dom";
 import { ellipsoid95, lengthText, REACH_95 } from "../geometry";
 import { copyText, textsToCopy } from "./copying";

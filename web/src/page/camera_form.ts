@@ -1,5 +1,5 @@
 // The camera of a photo: told by its EXIF, or typed.
-import { cameraText, type Camera } from "../api";
+import { cameraText, type Camera } from "visloc-client";
 import { element, field } from "../dom";
 import {
   CAMERA_MODELS,

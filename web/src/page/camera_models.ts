@@ -1,5 +1,5 @@
 // COLMAP's camera models, and a camera as text (docs/conventions.md, "Cameras").
-import { ownError, type Camera } from "../api";
+import { ownError, type Camera } from "visloc-client";
 
 /** Names of the parameters, in COLMAP's order. */
 export const CAMERA_MODELS: Readonly<Record<string, readonly string[]>> = {

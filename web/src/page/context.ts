@@ -1,9 +1,9 @@
 // What the parts of the page share.
-import type { Camera, MapInfo, Service } from "../api";
+import type { Camera, MapInfo, Client } from "visloc-client";
 import type { Viewer } from "../viewer/types";
 
 export interface PageContext {
-  readonly service: Service;
+  readonly service: Client;
   readonly viewer: Viewer;
   /** The map that is shown; null before one is chosen. */
   map(): MapInfo | null;

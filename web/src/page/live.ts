@@ -1,5 +1,5 @@
 // Live: the frames of this device's camera, localized one after the other on a walk.
-import { mapRef, type LocalizeResponse, type MapInfo } from "../api";
+import { mapRef, type LocalizeResponse, type MapInfo } from "visloc-client";
 import { element } from "../dom";
 import { lengthText } from "../geometry";
 import { countText, counted } from "../words";

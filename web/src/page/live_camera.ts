@@ -1,6 +1,6 @@
 // The intrinsics of live frames: given for photos of the same shape, from a field of view, or left
 // to the service.
-import { ServiceError, type Camera, type LocalizeResponse } from "../api";
+import { ServiceError, type Camera, type LocalizeResponse } from "visloc-client";
 import { median } from "./live_pace";
 
 export interface Size {

@@ -1,5 +1,5 @@
 // The figures of a walk: how many answers a second, how long they take, how many are poses.
-import type { LocalizeResponse } from "../api";
+import type { LocalizeResponse } from "visloc-client";
 import { secondsText } from "../words";
 import { RateWindow, Recent, median } from "./live_pace";
 

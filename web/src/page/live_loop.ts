@@ -1,5 +1,5 @@
 // Frame after frame, one at a time: the next is taken when the answer to the last is there.
-import { ownError, ServiceError, type LocalizeResponse } from "../api";
+import { ownError, ServiceError, type LocalizeResponse } from "visloc-client";
 import { afterFailure } from "./live_pace";
 
 /** A frame of the camera. */

@@ -1,5 +1,5 @@
 // How fast answers come, how long they take, and how long to wait after one that failed.
-import { ServiceError } from "../api";
+import { ServiceError } from "visloc-client";
 
 /** Counts what happened within the last `spanMs`, as a rate. */
 export class RateWindow {

@@ -1,6 +1,6 @@
 // A walk from its start to its stop: while the camera is open, the page is seen and there is a map,
 // frames are localized. Everything around may change meanwhile.
-import type { LocalizeResponse, MapInfo } from "../api";
+import type { LocalizeResponse, MapInfo } from "visloc-client";
 import { localizeFrames, pause, type Frame, type LoopParts } from "./live_loop";
 import { cameraProblem } from "./live_media";
 

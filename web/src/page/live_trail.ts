@@ -1,5 +1,5 @@
 // What was answered on a walk: a line to draw, and files for those who go on working with it.
-import type { LocalizeResponse, Vector3 } from "../api";
+import type { LocalizeResponse, Vector3 } from "visloc-client";
 import { length, subtract } from "../geometry";
 
 /** One answered frame. */

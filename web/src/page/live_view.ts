@@ -1,5 +1,5 @@
 // The pose of a walk in the 3D view, and the view that goes along.
-import type { LocalizeResponse } from "../api";
+import type { LocalizeResponse } from "visloc-client";
 import type { Viewer } from "../viewer/types";
 import { shownPose } from "./shown_pose";
 

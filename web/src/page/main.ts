@@ -1,7 +1,14 @@
 // The page that the service serves at `/`: puts its parts together.
-import { connect, mapRef, ownError, ServiceError, type MapInfo, type Problem } from "../api";
+import {
+  connect,
+  mapRef,
+  ownError,
+  PointsError,
+  ServiceError,
+  type MapInfo,
+  type Problem,
+} from "visloc-client";
 import { button, byId, element } from "../dom";
-import { PointsError } from "../points";
 import { NoGraphics } from "../viewer/graphics";
 import type { Viewer } from "../viewer/types";
 import { createViewer } from "../viewer/viewer";
@@ -30,7 +37,8 @@ server.search = server.hash = "";
 const announcer = byId("announcer", HTMLElement);
 const announce = (text: string): void => void (announcer.textContent = text);
 const key = createKeyEntry(byId("key", HTMLButtonElement));
-const service = connect(server, key.current);
+// Without a limit of its own: a photo over a slow line takes its time.
+const service = connect(server, { apiKey: key.current, timeoutSeconds: null });
 const theme = createTheme(byId("theme", HTMLSelectElement));
 const viewer = openViewer(byId("viewer", HTMLElement));
 const tabs = createTabs(document.querySelector<HTMLElement>("#panel > .tabs")!);

@@ -1,5 +1,6 @@
 // Which map is shown: the list of them, the choice, and the address that links to it.
-import { shortRef, ServiceError, type MapInfo, type Service } from "../api";
+import { ServiceError, type Client, type MapInfo } from "visloc-client";
+import { shortRef } from "../words";
 import { element } from "../dom";
 import { instantText } from "../words";
 
@@ -23,7 +24,7 @@ const ASK_AGAIN_MS = 3000;
 /** Let `select` and the address choose; `onChoice` is told what came of it. */
 export function createMapChoice(
   select: HTMLSelectElement,
-  service: Service,
+  service: Client,
   onChoice: (choice: Choice) => void,
 ): MapChoice {
   let maps: MapInfo[] = [];

@@ -1,16 +1,18 @@
 // A map into the viewer: its cameras, and its landmarks from coarse to fine.
 import {
   mapRef,
+  ROW_BYTES,
   type MapImage,
   type MapImages,
   type MapInfo,
-  type Service,
+  type PointBlock,
+  type Client,
   type Tile,
   type Vector3,
-} from "../api";
+} from "visloc-client";
 import { add, apply, product, rotationMatrix, scale, worldUp } from "../geometry";
-import { MAX_POINTS, parsePoints, ROW_BYTES, streamPoints } from "../points";
-import type { PointBlock, Viewer } from "../viewer/types";
+import { MAX_POINTS, streamPoints } from "../points";
+import type { Viewer } from "../viewer/types";
 import { counted, countText } from "../words";
 
 const IMAGES_PAGE = 5000;
@@ -34,7 +36,7 @@ export interface Loading {
 /** Show a map, or the tiles of a set. Throws what the service refuses, and PointsError for landmarks that are none. */
 export async function loadMap(
   map: MapInfo,
-  service: Service,
+  service: Client,
   viewer: Viewer,
   loading: Loading,
 ): Promise<void> {
@@ -72,7 +74,7 @@ export async function loadMap(
   await Promise.all([cameras, points]);
 }
 
-async function allImages(service: Service, ref: string, signal: AbortSignal): Promise<MapImages> {
+async function allImages(service: Client, ref: string, signal: AbortSignal): Promise<MapImages> {
   const all = await service.images(ref, 0, IMAGES_PAGE, signal);
   const wanted = Math.min(all.total, MAX_IMAGES);
   while (all.images.length < wanted) {
@@ -94,7 +96,7 @@ export function shownTiles(map: MapInfo): string {
 /** Show the tiles of a set in its frame: the first ones of a large set, and an even sample of each. */
 async function loadTiles(
   map: MapInfo,
-  service: Service,
+  service: Client,
   viewer: Viewer,
   loading: Loading,
 ): Promise<void> {
@@ -116,7 +118,7 @@ async function loadTiles(
       all.images.push({ ...movedImage(image, tile), camera: `${ref}/${image.camera}` });
     }
     for (const [id, camera] of Object.entries(images.cameras)) all.cameras[`${ref}/${id}`] = camera;
-    const block = movedBlock(parsePoints(points), tile);
+    const block = movedBlock(points, tile);
     viewer.addPoints(block);
     loaded += block.count;
     loading.onBlock({ ...block, total: Math.max(map.landmarks, loaded) }, loaded);

@@ -1,12 +1,12 @@
 // The tab "Map": what the map is, and how it is shown.
-import { shortRef, type MapImages, type MapInfo } from "../api";
+import type { MapImages, MapInfo, PointBlock } from "visloc-client";
 import { element, facts, field } from "../dom";
 import { lengthText } from "../geometry";
 import { MAX_POINTS } from "../points";
 import { PALETTES, SEEN_BY_MOST } from "../viewer/themes";
-import type { PointBlock, PointColours, Theme, Viewer } from "../viewer/types";
+import type { PointColours, Theme, Viewer } from "../viewer/types";
 import { MAX_IMAGES, shownTiles } from "./map_loading";
-import { bytesText, counted, countText, instantText } from "../words";
+import { bytesText, counted, countText, instantText, shortRef } from "../words";
 
 export interface MapPanel {
   /** Something else than a map: why there is none. */

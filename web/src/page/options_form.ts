@@ -1,5 +1,5 @@
 // What may be chosen per photo. What is left alone is not sent: the service has its defaults.
-import { ownError, ServiceError, type OptionSchema, type Service } from "../api";
+import { ownError, ServiceError, type OptionSchema, type Client } from "visloc-client";
 import { button, element, field } from "../dom";
 import { sentence } from "./problem_view";
 
@@ -14,7 +14,7 @@ export interface OptionsForm {
 }
 
 /** Which options there are, and their words, the service says once the form is opened. */
-export function createOptionsForm(service: Pick<Service, "options">): OptionsForm {
+export function createOptionsForm(service: Pick<Client, "options">): OptionsForm {
   let controls: Control[] = [];
   let asked = false;
   const fields = element("div", { class: "fields wide" });

@@ -1,5 +1,5 @@
 // A service that is busy says how long to wait: that is done, rather than asking by hand.
-import { ServiceError, type Service } from "../api";
+import { ServiceError, type Client } from "visloc-client";
 import { pause } from "./live_loop";
 
 const MOST_WAITS = 6;
@@ -12,7 +12,7 @@ export function busySeconds({ problem, retryAfterSeconds }: ServiceError): numbe
 }
 
 /** The same service; what it sends of maps is asked for again, a few times, when it is busy. */
-export function patiently(service: Service): Service {
+export function patiently(service: Client): Client {
   async function patient<Answer>(ask: () => Promise<Answer>, signal?: AbortSignal) {
     for (let waits = 0; ; waits++) {
       try {

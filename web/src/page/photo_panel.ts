@@ -6,8 +6,8 @@ import {
   type LocalizeResponse,
   type MapInfo,
   type Problem,
-  type Service,
-} from "../api";
+  type Client,
+} from "visloc-client";
 import { button, byId, element } from "../dom";
 import type { ShownPose, Viewer } from "../viewer/types";
 import { answerView, inShort } from "./answer_view";
@@ -20,7 +20,7 @@ import { shownPlaces } from "./shown_pose";
 import { countText } from "../words";
 
 export interface PhotoPanelParts {
-  service: Service;
+  service: Client;
   server: URL;
   viewer: Viewer;
   map(): MapInfo | null;

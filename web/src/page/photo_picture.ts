@@ -1,6 +1,6 @@
 // The photo with what was matched in it, upright. The service counts pixels as stored: what it found
 // is turned as the photo is.
-import type { LocalizeResponse } from "../api";
+import type { LocalizeResponse } from "visloc-client";
 import { button, element } from "../dom";
 import { countText } from "../words";
 

@@ -3,15 +3,15 @@ import {
   mapRef,
   ownError,
   ServiceError,
-  shortRef,
   type Camera,
   type LocalizeResponse,
   type MapInfo,
-  type Service,
-} from "../api";
+  type Client,
+} from "visloc-client";
 import { pause } from "./live_loop";
 import { busySeconds } from "./patience";
 import type { Question } from "./snippets";
+import { shortRef } from "../words";
 
 /** What is asked about a photo, as it was chosen when the photo came. */
 export interface Wish {
@@ -53,7 +53,7 @@ export interface PhotoQueue {
 
 /** `onChange` is told of every change of an entry. */
 export function createPhotoQueue(
-  service: Service,
+  service: Client,
   hasKey: () => boolean,
   onChange: (entry: Entry) => void,
 ): PhotoQueue {

@@ -1,5 +1,5 @@
 // What the service refused, or why it did not answer, in words; and what to do.
-import type { ServiceError } from "../api";
+import type { ServiceError } from "visloc-client";
 import { button, element, facts } from "../dom";
 
 export interface ProblemActions {

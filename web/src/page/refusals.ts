@@ -1,6 +1,6 @@
 // Why there is no pose, and what to try next: the table of docs/api.md, "When there is no pose", in
 // the words of the page.
-import type { LocalizeResponse } from "../api";
+import type { LocalizeResponse } from "visloc-client";
 
 /** The stages of an answer, in their order; each can give up. */
 export const STAGES = [

@@ -5,7 +5,7 @@ import {
   type PoseEstimate,
   type Quaternion,
   type Vector3,
-} from "../api";
+} from "visloc-client";
 import { positionCovariance, type Matrix3 } from "../geometry";
 import type { ShownPose } from "../viewer/types";
 

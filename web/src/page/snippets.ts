@@ -1,5 +1,5 @@
 // The question and its answer as text to take along: JSON, a line for a shell, lines of Python.
-import { cameraText, type Camera, type LocalizeResponse } from "../api";
+import { cameraText, type Camera, type LocalizeResponse } from "visloc-client";
 
 /** What was asked. */
 export interface Question {

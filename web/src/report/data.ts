@@ -1,5 +1,5 @@
 // What `mapping report` writes into its file, as JSON in <script type="application/json" id="report">.
-import type { Camera, MapImage, Vector3 } from "../api";
+import type { Camera, MapImage, Vector3 } from "visloc-client";
 
 /** Counts of values that fall between `edges[i]` and `edges[i + 1]`. */
 export interface Histogram {

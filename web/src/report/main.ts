@@ -2,8 +2,7 @@
 import "../style/tokens.css";
 import "../style/report.css";
 import { element } from "../dom";
-import { parsePoints } from "../points";
-import type { PointBlock } from "../viewer/types";
+import { parsePoints, type PointBlock } from "visloc-client";
 import { bytesText, countText } from "../words";
 import { histogramChart } from "./charts";
 import type { ReportData } from "./data";

@@ -1,5 +1,5 @@
 // Where things lie on the plan: the map seen from above, `right` to the right and `ahead` up.
-import type { Quaternion, Vector3 } from "../api";
+import type { Quaternion, Vector3 } from "visloc-client";
 import { add, cross, dot, percentile, scale } from "../geometry";
 import type { ReportData } from "./data";
 

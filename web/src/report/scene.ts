@@ -2,7 +2,8 @@
 import { element } from "../dom";
 import { NoGraphics } from "../viewer/graphics";
 import { createViewer } from "../viewer/viewer";
-import type { CoverageArrow, PointBlock, Theme, Viewer } from "../viewer/types";
+import type { PointBlock } from "visloc-client";
+import type { CoverageArrow, Theme, Viewer } from "../viewer/types";
 import type { ReportData } from "./data";
 import { directionOf, orientationOf } from "./plan";
 

@@ -26,11 +26,11 @@ import {
   WebGLRenderTarget,
   type WebGLRenderer,
 } from "three";
-import type { Vector3 } from "../api";
+import { ROW_BYTES, type PointBlock, type Vector3 } from "visloc-client";
 import { subtract } from "../geometry";
-import { MAX_POINTS, ROW_BYTES } from "../points";
+import { MAX_POINTS } from "../points";
 import { SEEN_BY_MOST, rgb, type Palette } from "./themes";
-import type { PointBlock, PointColours } from "./types";
+import type { PointColours } from "./types";
 
 const WORDS = ROW_BYTES / 4;
 

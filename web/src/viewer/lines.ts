@@ -14,7 +14,7 @@ import {
 import { LineMaterial } from "three/examples/jsm/lines/LineMaterial.js";
 import { LineSegments2 } from "three/examples/jsm/lines/LineSegments2.js";
 import { LineSegmentsGeometry } from "three/examples/jsm/lines/LineSegmentsGeometry.js";
-import type { Vector3 } from "../api";
+import type { Vector3 } from "visloc-client";
 import { rgb } from "./themes";
 
 /** Lines as thin as a pixel, from each second position to the next. */

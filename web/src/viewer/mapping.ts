@@ -1,6 +1,6 @@
 // The mapping cameras: all in one set of lines, those that stand out drawn again in another colour.
 import { BufferAttribute, Group, Mesh, MeshBasicMaterial, DoubleSide, BufferGeometry } from "three";
-import type { Camera, MapImage, Quaternion, Vector3 } from "../api";
+import type { Camera, MapImage, Quaternion, Vector3 } from "visloc-client";
 import { cornerRays, frustumCorners, subtract } from "../geometry";
 import { boldLines, discard, pyramidEdges, thinLines } from "./lines";
 import type { Palette } from "./themes";

@@ -9,7 +9,7 @@ import {
   type Object3D,
   type PerspectiveCamera,
 } from "three";
-import type { Vector3 } from "../api";
+import type { Vector3 } from "visloc-client";
 import { cornerRays, ellipsoid95, frustumCorners, subtract, type Matrix3 } from "../geometry";
 import { boldLines, discard, dots, pyramidEdges, thinLines } from "./lines";
 import { imagePlanes } from "./mapping";

@@ -12,7 +12,7 @@ import {
   Quaternion,
   Vector3 as Vector,
 } from "three";
-import type { Vector3 } from "../api";
+import type { Vector3 } from "visloc-client";
 import { medianSpacing, niceLength, subtract } from "../geometry";
 import { boldLines, thinLines } from "./lines";
 import { probabilityColour, type Palette } from "./themes";

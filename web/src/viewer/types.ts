@@ -1,21 +1,5 @@
 // What can be shown of a map, and what the page and the report ask of the viewer.
-import type { Camera, MapImage, Quaternion, Vector3 } from "../api";
-
-/**
- * Landmarks in the order of their level of detail: every beginning is an even sample of the map.
- * Rows of 16 bytes, as the service sends them: x, y, z float32 relative to `origin`, then red,
- * green, blue and the number of photos that see the landmark, each a byte.
- */
-export interface PointBlock {
-  /** Landmarks of the whole map. */
-  total: number;
-  /** Rank of the first one of this block. */
-  first: number;
-  count: number;
-  coloured: boolean;
-  origin: Vector3;
-  rows: ArrayBuffer;
-}
+import type { Camera, MapImage, PointBlock, Quaternion, Vector3 } from "visloc-client";
 
 /** A camera to draw: world_from_cam, and how it sees. */
 export interface Frustum {

@@ -1,6 +1,6 @@
 // The 3D view of a map. Draws when something has changed, and only then.
 import { Group, Scene, Vector3 as Vector } from "three";
-import type { Camera, MapImage, Vector3 } from "../api";
+import type { Camera, MapImage, Vector3 } from "visloc-client";
 import { element } from "../dom";
 import { add, medianSpacing, percentile, scale, subtract, viewingDirection } from "../geometry";
 import { counted } from "../words";

@@ -1,5 +1,12 @@
 import { afterEach, describe, expect, test, vi } from "vitest";
-import { connect, localizeForm, mapRef, ServiceError, type LocalizeCall } from "../src/api";
+import {
+  connect,
+  localizeForm,
+  mapRef,
+  ServiceError,
+  type Features,
+  type LocalizeCall,
+} from "visloc-client";
 
 const BASE = new URL("https://maps.example.org/visloc/");
 const CALL: LocalizeCall = {
@@ -8,6 +15,13 @@ const CALL: LocalizeCall = {
   name: 'a "b".jpg',
   camera: null,
   options: {},
+};
+
+const FEATURES: Features = {
+  kind: "xfeat",
+  keypoints: new Float32Array([0.5, 0.5, 1.5, 0.5]),
+  descriptors: new Int8Array([1, 2, -3, 4, 5, 6]),
+  global_descriptors: { gem: new Uint8Array([7, 8]) },
 };
 
 /** Answer every request with this, and return the requests. */
@@ -37,10 +51,10 @@ afterEach(() => vi.unstubAllGlobals());
 describe("asking", () => {
   test("goes below the address of the page, with names that are escaped", async () => {
     const asked = answering(() => json({ maps: [] }));
-    const service = connect(BASE, () => null);
+    const service = connect(BASE);
     await service.maps();
     await failure(service.map("kitchen@1"));
-    await service.points("../../evil?x#y", 5, 10);
+    await failure(service.points("../../evil?x#y", 5, 10));
     await failure(service.images("kitchen", 0, 1000));
     expect(asked.map(({ url }) => url)).toEqual([
       "https://maps.example.org/visloc/maps",
@@ -53,13 +67,33 @@ describe("asking", () => {
   test("sends the API key only when one is given, and the newest", async () => {
     const asked = answering(() => json({ maps: [] }));
     let key: string | null = null;
-    const service = connect(BASE, () => key);
+    const service = connect(BASE, { apiKey: () => key });
     await service.maps();
     key = "secret";
     await service.maps();
     expect(asked.map(({ headers }) => headers.get("Authorization"))).toEqual([
       null,
       "Bearer secret",
+    ]);
+  });
+
+  test("may have one key, and an address without a slash", async () => {
+    const asked = answering(() => json({ maps: [] }));
+    await connect("https://maps.example.org/visloc", { apiKey: "secret" }).maps();
+    expect(asked[0]!.url).toBe("https://maps.example.org/visloc/maps");
+    expect(asked[0]!.headers.get("Authorization")).toBe("Bearer secret");
+  });
+
+  test("names the map for a balancer, and the time that is allowed", async () => {
+    const asked = answering(() => json({}));
+    await failure(connect(BASE, { timeoutSeconds: 2.5 }).map("kitchen@7"));
+    await failure(connect(BASE, { timeoutSeconds: null }).maps());
+    const named = asked.map(({ headers }) =>
+      ["X-Visloc-Map", "X-Request-Timeout"].map((name) => headers.get(name)),
+    );
+    expect(named).toEqual([
+      ["kitchen", "2.5"],
+      [null, null],
     ]);
   });
 
@@ -92,15 +126,62 @@ describe("the form of a photo", () => {
     expect((localizeForm({ ...CALL, name: "" }).get("image") as File).name).toBe("photo");
   });
 
+  test("takes bytes, and a mask", async () => {
+    const form = localizeForm({
+      map: "kitchen",
+      image: new Uint8Array([1, 2, 3]),
+      mask: new Blob(["m"]),
+    });
+    expect([...form.keys()]).toEqual(["map", "image", "mask"]);
+    expect(await (form.get("image") as File).bytes()).toEqual(new Uint8Array([1, 2, 3]));
+  });
+
+  test("takes features instead", async () => {
+    const form = localizeForm({ map: "kitchen", features: FEATURES });
+    expect([...form.keys()]).toEqual(["map", "features"]);
+    const sent = JSON.parse(await (form.get("features") as File).text());
+    expect(sent).toEqual({
+      kind: "xfeat",
+      keypoints: { dtype: "float32", shape: [2, 2], data: "AAAAPwAAAD8AAMA/AAAAPw==" },
+      descriptors: { dtype: "int8", shape: [2, 3], data: "AQL9BAUG" },
+      global_descriptors: { gem: { dtype: "uint8", shape: [2], data: "Bwg=" } },
+    });
+  });
+
   test("is posted", async () => {
     const answer = {
       ...{ status: "not_localized", camera: {}, orientation: {}, retrieved: [], map: {} },
       ...{ seconds: {} },
     };
     const asked = answering(() => json(answer));
-    expect(await connect(BASE, () => null).localize(CALL)).toEqual(answer);
+    expect(await connect(BASE).localize(CALL)).toEqual(answer);
     expect(asked[0]!.method).toBe("POST");
     expect(asked[0]!.headers.get("Content-Type")).toMatch(/^multipart\/form-data/);
+  });
+});
+
+describe("the form of a rig", () => {
+  test("has a file for each photo, which the request names", async () => {
+    const answer = { status: "not_localized", images: [], map: {}, seconds: {} };
+    const asked = answering(() => json(answer));
+    const image = new Blob(["left"]);
+    const mask = new Blob(["mask"]);
+    const images = [
+      { sensor: "left", image, mask, timestamp: 5 },
+      { sensor: "right", features: FEATURES },
+    ];
+    await connect(BASE).localizeRig({ map: "kitchen@7", rig: "rig", images });
+    expect(asked[0]!.url).toBe("https://maps.example.org/visloc/localize/rig");
+    expect(asked[0]!.headers.get("X-Visloc-Map")).toBe("kitchen");
+    const form = await asked[0]!.formData();
+    const request = JSON.parse(form.get("request") as string);
+    expect(request.images[0]).toEqual({
+      ...{ sensor: "left", timestamp: 5, part: "image0", mask_part: "image1" },
+    });
+    expect(request.images[1].features.kind).toBe("xfeat");
+    expect(request).toMatchObject({ map: "kitchen@7", rig: "rig" });
+    expect(await (form.get("image0") as File).text()).toBe("left");
+    expect(await (form.get("image1") as File).text()).toBe("mask");
   });
 });
 
@@ -109,13 +190,13 @@ describe("the options of a query", () => {
     const solver = { title: "pose solver", enum: ["pycolmap", null], default: "pycolmap" };
     const schemas = { LocalizeOptions: { properties: { solver } } };
     const asked = answering(() => json({ components: { schemas } }));
-    expect(await connect(BASE, () => null).options()).toEqual({ solver });
+    expect(await connect(BASE).options()).toEqual({ solver });
     expect(asked[0]!.url).toBe("https://maps.example.org/visloc/openapi.json");
   });
 
   test("are no options where something else answers", async () => {
     answering(() => json({ components: {} }));
-    const { problem } = await failure(connect(BASE, () => null).options());
+    const { problem } = await failure(connect(BASE).options());
     expect(problem.code).toBe("server.answer");
   });
 });
@@ -135,7 +216,7 @@ describe("errors", () => {
     answering(() =>
       json({ type: "about:blank", kind: "InvalidInput", ...problem }, { status: 422 }),
     );
-    const error = await failure(connect(BASE, () => null).localize(CALL));
+    const error = await failure(connect(BASE).localize(CALL));
     expect(error.problem).toEqual(problem);
     expect(error.message).toBe(problem.detail);
     expect(error.retryAfterSeconds).toBeNull();
@@ -144,12 +225,12 @@ describe("errors", () => {
   test("say how long to wait, when the service does", async () => {
     const headers = { "Retry-After": "7" };
     answering(() => json({ code: "server.busy", detail: "busy" }, { status: 429, headers }));
-    expect((await failure(connect(BASE, () => null).maps())).retryAfterSeconds).toBe(7);
+    expect((await failure(connect(BASE).maps())).retryAfterSeconds).toBe(7);
   });
 
   test("tell a proxy's page from an error of the service", async () => {
     answering(() => new Response("<h1>Bad gateway</h1>", { status: 502 }));
-    const { problem } = await failure(connect(BASE, () => null).maps());
+    const { problem } = await failure(connect(BASE).maps());
     expect([problem.code, problem.status]).toEqual(["server.answer", 502]);
   });
 
@@ -160,7 +241,7 @@ describe("errors", () => {
     ["Wed, 21 Oct 2026 07:28:00 GMT", null],
   ])("that ask to wait %s are waited after for %s s", async (asked, seconds) => {
     answering(() => json({}, { status: 429, headers: { "Retry-After": asked } }));
-    expect((await failure(connect(BASE, () => null).maps())).retryAfterSeconds).toBe(seconds);
+    expect((await failure(connect(BASE).maps())).retryAfterSeconds).toBe(seconds);
   });
 
   describe.each([
@@ -169,7 +250,7 @@ describe("errors", () => {
     ["a number", () => json(7)],
     ["null", () => json(null)],
   ])("an answer that is %s is none", (_, respond) => {
-    const service = connect(BASE, () => null);
+    const service = connect(BASE);
     test.each([
       ["maps", () => service.maps()],
       ["map", () => service.map("kitchen")],
@@ -183,14 +264,56 @@ describe("errors", () => {
 
   test("a service that is not there is unreachable", async () => {
     answering(() => Promise.reject(new TypeError("Failed to fetch")));
-    const { problem } = await failure(connect(BASE, () => null).maps());
+    const { problem } = await failure(connect(BASE).maps());
     expect([problem.code, problem.status]).toEqual(["server.unreachable", 0]);
+  });
+
+  test.each([
+    ["is being stopped", () => json({ code: "server.stopping" }, { status: 503 })],
+    ["is behind a balancer that lost it", () => new Response("", { status: 502 })],
+    ["broke the connection", () => Promise.reject(new TypeError("Failed to fetch"))],
+  ])("a service that %s is asked once more, with the whole form", async (_, fail) => {
+    const answers = [fail, () => json({ code: "image.empty" }, { status: 422 })];
+    const asked = answering(() => answers.shift()!());
+    expect((await failure(connect(BASE).localize(CALL))).code).toBe("image.empty");
+    expect(asked).toHaveLength(2);
+    expect(await ((await asked[1]!.formData()).get("image") as File).text()).toBe("photo");
+  });
+
+  test("of a service that is merely busy are not repeated", async () => {
+    const asked = answering(() => json({ code: "server.busy" }, { status: 503 }));
+    expect((await failure(connect(BASE).maps())).code).toBe("server.busy");
+    expect(asked).toHaveLength(1);
+  });
+
+  test("tell a service that does not answer in time", async () => {
+    vi.stubGlobal(
+      "fetch",
+      (_: URL, { signal }: RequestInit) =>
+        new Promise((_, reject) =>
+          signal!.addEventListener("abort", () => reject(signal!.reason as Error)),
+        ),
+    );
+    const error = await failure(connect(BASE, { timeoutSeconds: 0.05 }).maps());
+    expect([error.code, error.expected]).toEqual(["server.timeout", "an answer within 0.05 s"]);
+    const gone = new Error("gone");
+    const stop = new AbortController();
+    const asked = connect(BASE).maps(stop.signal);
+    stop.abort(gone);
+    await expect(asked).rejects.toBe(gone);
+  });
+
+  test("are landmarks that are none", async () => {
+    answering(() => new Response("<h1>Sign in</h1>"));
+    const { code, message } = await failure(connect(BASE).points("kitchen", 0, 10));
+    expect(code).toBe("server.answer");
+    expect(message).toMatch(/less than their header/);
   });
 
   test("what the page itself gave up is no error of the service", async () => {
     const aborted = new DOMException("given up", "AbortError");
     answering(() => Promise.reject(aborted));
     const signal = AbortSignal.abort(aborted);
-    await expect(connect(BASE, () => null).maps(signal)).rejects.toBe(aborted);
+    await expect(connect(BASE).maps(signal)).rejects.toBe(aborted);
   });
 });

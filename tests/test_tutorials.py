@@ -1,0 +1,76 @@
+"""The commands of docs/tutorials, one after the other, as their reader pastes them."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+from mapping.build.build import build_map
+from mapping.build.settings import BuildSettings
+from mapping.sample import write_sample
+from tests import docs_check
+from tests.rosbags_made import write_bag
+from visloc.kapture import read_dataset
+
+# How many commands run; your-room takes a minute more, in tests/mapping/capture/test_tutorial.py.
+TUTORIALS = {
+    "building": 8,
+    "compare-features": 8,
+    "for-others": 12,
+    "from-hloc": 5,
+    "robot": 6,
+    "your-app": 4,
+}
+WITHOUT_COMMANDS = "from-hosted"
+# They make maps.
+SLOW = ("building", "compare-features", "from-hloc", "robot")
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What ``make demo`` leaves in ``.demo``, smaller: its dataset, its map and two photos."""
+    folder = tmp_path_factory.mktemp("demo")
+    dataset = folder / "dataset"
+    write_sample(dataset, images=16, size=(320, 240))
+    settings = BuildSettings(dataset / "mapping", "sample", folder / "maps")
+    build_map(settings, lambda *_: None)
+    for camera, name in (("left", "photo.jpg"), ("right", "right.jpg")):
+        photos = dataset / "query/sensors/records_data/query" / camera
+        shutil.copy(photos / "0001.jpg", folder / name)
+    return folder
+
+
+def test_every_tutorial_is_run() -> None:
+    pages = {page.stem for page in (docs_check.ROOT / "docs" / "tutorials").glob("*.md")}
+    assert pages == {*TUTORIALS, WITHOUT_COMMANDS, "your-room"}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in TUTORIALS],
+)
+def test_the_commands_of_a_tutorial_run(name: str, demo: Path, tmp_path: Path) -> None:
+    commands = docs_check.commands_of(docs_check.ROOT / "docs" / "tutorials" / f"{name}.md")
+    if any(command.text.startswith("npm ") for command in commands):
+        if shutil.which("npm") is None:
+            pytest.skip("needs Node.js: `npm` on PATH")
+        if not (docs_check.ROOT / "web" / "client" / "dist").is_dir():
+            pytest.skip("needs the built client, which `make page` makes")
+    shutil.copytree(demo, tmp_path / ".demo")
+    (tmp_path / ".venv").symlink_to(Path(sys.executable).parents[1])
+    for folder in ("examples", "web"):
+        (tmp_path / folder).symlink_to(docs_check.ROOT / folder)
+    if name == "robot":
+        write_bag(tmp_path / "walk.bag", read_dataset(demo / "dataset" / "mapping"), ros1=True)
+    desk, did = docs_check.Desk(tmp_path), []
+    try:
+        for command in commands:
+            what, problem = docs_check.checked(command, desk)
+            assert problem == "", command.text
+            did.append(what)
+    finally:
+        desk.close()
+    assert did.count("run") == TUTORIALS[name]

@@ -1,0 +1,196 @@
+// Speaks the service's HTTP API (docs/api.md), in browsers and in Node.js.
+//
+// What the service answers is taken for what it says it is; what is no answer of the service, such
+// as a proxy's page, is told apart here, so that callers meet one kind of error: ServiceError.
+import { noAnswer, ownError, serviceError, type ServiceError } from "./errors.js";
+import { parsePoints, PointsError, type PointBlock } from "./points.js";
+import { localizeForm, rigForm, type LocalizeCall, type RigCall } from "./requests.js";
+import type { LocalizeResponse, MapImages, MapInfo, OptionSchema, RigResponse } from "./words.js";
+
+/** Before a request is sent a second time, to another server behind the same address. */
+const RESEND_PAUSE_MS = 100;
+const DEFAULT_TIMEOUT_S = 60;
+
+export interface Settings {
+  /** A function is asked before each request; null for none. */
+  apiKey?: string | (() => string | null);
+  /** Longest wait for an answer, seconds; the service gets the same limit. Null: the service's own. */
+  timeoutSeconds?: number | null;
+}
+
+/** Every method throws ServiceError, or what `signal` was aborted with. */
+export interface Client {
+  /** Say where a photo was taken: a pose, or why there is none. */
+  localize(call: LocalizeCall, signal?: AbortSignal): Promise<LocalizeResponse>;
+  /** Say where several cameras that move together are, from their photos of one instant. */
+  localizeRig(call: RigCall, signal?: AbortSignal): Promise<RigResponse>;
+  maps(signal?: AbortSignal): Promise<MapInfo[]>;
+  /** Describe one map: an id or `id@version`. */
+  map(ref: string, signal?: AbortSignal): Promise<MapInfo>;
+  /** Landmarks in an order of which every beginning is an even sample of the map. */
+  points(ref: string, first: number, count: number, signal?: AbortSignal): Promise<PointBlock>;
+  /** Where the mapping photos were taken, in the map's order. */
+  images(ref: string, first: number, count: number, signal?: AbortSignal): Promise<MapImages>;
+  /** The options of a query, by name. */
+  options(): Promise<Record<string, OptionSchema>>;
+}
+
+/** Speak with the service at an address, such as `http://127.0.0.1:8000`. Nothing is sent yet. */
+export function connect(server: string | URL, settings: Settings = {}): Client {
+  const base = new URL(server);
+  if (!base.pathname.endsWith("/")) base.pathname += "/";
+  const { apiKey = null, timeoutSeconds = DEFAULT_TIMEOUT_S } = settings;
+
+  /** Ask once more where another server may answer: all that is asked here changes nothing. */
+  async function ask(path: string, request: Asking): Promise<Response> {
+    const first = await once(path, request);
+    if (first instanceof Response && first.ok) return first;
+    const error = first instanceof Response ? await serviceError(first) : first;
+    if (!mayResend(error)) throw error;
+    await new Promise((resolve) => setTimeout(resolve, RESEND_PAUSE_MS));
+    request.signal?.throwIfAborted();
+    const second = await once(path, request);
+    if (!(second instanceof Response)) throw second;
+    if (!second.ok) throw await serviceError(second);
+    return second;
+  }
+
+  async function once(path: string, request: Asking): Promise<Response | ServiceError> {
+    const headers = new Headers();
+    const given = typeof apiKey === "function" ? apiKey() : apiKey;
+    if (given !== null) headers.set("Authorization", `Bearer ${given}`);
+    // A balancer sends the requests of a map to the server that has it open.
+    if (request.map !== undefined) headers.set("X-Visloc-Map", request.map.split("@")[0] ?? "");
+    if (timeoutSeconds !== null) headers.set("X-Request-Timeout", String(timeoutSeconds));
+    const form = request.form?.();
+    try {
+      return await fetch(new URL(path, base), {
+        ...(form === undefined ? {} : { method: "POST", body: form }),
+        ...(request.limit === null ? {} : { signal: request.limit }),
+        headers,
+      });
+    } catch (error) {
+      if (request.signal?.aborted) throw error;
+      return brokenOff(error, request, "server.unreachable", "the service cannot be reached");
+    }
+  }
+
+  /** Read a body; one that breaks off or is of another kind is no answer of the service. */
+  async function whole<Body>(request: Asking, read: () => Promise<Body>): Promise<Body> {
+    try {
+      return await read();
+    } catch (error) {
+      if (request.signal?.aborted) throw error;
+      throw brokenOff(error, request, "server.answer", "the answer is not one of the service");
+    }
+  }
+
+  function brokenOff(error: unknown, request: Asking, code: string, detail: string): ServiceError {
+    if (request.limit?.aborted !== true) return noAnswer(code, detail, String(error));
+    const seconds = `${timeoutSeconds} s`;
+    return ownError("server.timeout", "No answer", "the service did not answer in time", {
+      expected: `an answer within ${seconds}`,
+    });
+  }
+
+  /** Ask for JSON that has `members`, those that everything else is read after. */
+  async function readJson<Answer>(
+    path: string,
+    what: string,
+    members: (keyof Answer)[],
+    request: Asking,
+  ): Promise<Answer> {
+    const response = await ask(path, request);
+    const answer = await whole(request, () => response.json() as Promise<Answer | null>);
+    const known = typeof answer === "object" && answer !== null;
+    if (!known || members.some((member) => answer[member] == null)) {
+      throw noAnswer("server.answer", `this is not ${what}`, JSON.stringify(answer));
+    }
+    return answer;
+  }
+
+  function asking(
+    signal: AbortSignal | undefined,
+    more: Pick<Asking, "map" | "form"> = {},
+  ): Asking {
+    const limits = signal === undefined ? [] : [signal];
+    if (timeoutSeconds !== null) limits.push(AbortSignal.timeout(1000 * timeoutSeconds));
+    const limit = limits.length > 1 ? AbortSignal.any(limits) : (limits[0] ?? null);
+    return { ...more, signal: signal ?? null, limit };
+  }
+
+  const mapPath = (ref: string): string => `maps/${encodeURIComponent(ref)}`;
+
+  return {
+    localize: (call, signal) =>
+      readJson(
+        "localize",
+        "the answer to a photo",
+        ["status", "camera", "orientation", "retrieved", "map", "seconds"],
+        asking(signal, { map: call.map, form: () => localizeForm(call) }),
+      ),
+    localizeRig: (call, signal) =>
+      readJson(
+        "localize/rig",
+        "the answer to the photos of a rig",
+        ["status", "images", "map", "seconds"],
+        asking(signal, { map: call.map, form: () => rigForm(call) }),
+      ),
+    async maps(signal) {
+      type Listed = { maps: MapInfo[] };
+      return (await readJson<Listed>("maps", "the list of maps", ["maps"], asking(signal))).maps;
+    },
+    map: (ref, signal) =>
+      readJson(
+        mapPath(ref),
+        "a map",
+        ["id", "version", "extent", "down", "versions", "global_features", "tiles"],
+        asking(signal, { map: ref }),
+      ),
+    async points(ref, first, count, signal) {
+      const request = asking(signal, { map: ref });
+      const response = await ask(`${mapPath(ref)}/points?first=${first}&count=${count}`, request);
+      const body = await whole(request, () => response.arrayBuffer());
+      try {
+        return parsePoints(body);
+      } catch (error) {
+        if (!(error instanceof PointsError)) throw error;
+        throw noAnswer("server.answer", error.message, "");
+      }
+    },
+    images: (ref, first, count, signal) =>
+      readJson(
+        `${mapPath(ref)}/images?first=${first}&count=${count}`,
+        "the list of a map's photos",
+        ["images", "cameras", "total"],
+        asking(signal, { map: ref }),
+      ),
+    async options() {
+      type Described = { components: { schemas?: Record<string, { properties?: unknown }> } };
+      const what = "the description of the API";
+      const request = asking(undefined);
+      const said = await readJson<Described>("openapi.json", what, ["components"], request);
+      const options = said.components.schemas?.["LocalizeOptions"]?.properties;
+      if (options == null) throw noAnswer("server.answer", `this is not ${what}`, "");
+      return options as Record<string, OptionSchema>;
+    },
+  };
+}
+
+/** One request, which may be sent twice: a form is made for each time. */
+interface Asking {
+  map?: string;
+  form?: () => FormData;
+  /** The caller's. */
+  signal: AbortSignal | null;
+  /** The caller's, and the time that is left. */
+  limit: AbortSignal | null;
+}
+
+function mayResend({ problem }: ServiceError): boolean {
+  return (
+    problem.code === "server.unreachable" ||
+    problem.code === "server.stopping" ||
+    problem.status === 502
+  );
+}

@@ -1,0 +1,127 @@
+// What is asked of the service, and how it is written as a form.
+import type { Camera, Transform } from "./words.js";
+import { cameraText } from "./words.js";
+
+/** A photo, as a file or its bytes: JPEG, PNG, WebP, HEIC and others. */
+export type Photo = Blob | Uint8Array<ArrayBuffer>;
+/** Numbers, row by row. */
+export type FeatureArray =
+  Float32Array<ArrayBuffer> | Uint8Array<ArrayBuffer> | Int8Array<ArrayBuffer>;
+
+/** What was found in a photo, instead of the photo: docs/api.md, "Send features". */
+export interface Features {
+  /** The map's `local_features`. */
+  kind: string;
+  /** N x 2: x, y in pixels of the camera; the centre of the top-left pixel is (0.5, 0.5). */
+  keypoints: FeatureArray;
+  /** N x D; the service normalizes them. */
+  descriptors: FeatureArray;
+  /** D numbers for each of the map's `global_features`. */
+  global_descriptors: Record<string, FeatureArray>;
+}
+
+/** A photo, or what was found in it, with its intrinsics where they are known. */
+interface Asked {
+  image?: Photo;
+  features?: Features;
+  /** Black pixels of it hide keypoints of the photo. */
+  mask?: Photo;
+  /** Without one, the service reads the photo's EXIF or estimates the focal length. */
+  camera?: Camera | null;
+}
+
+/** Where to look, and how: the fields of docs/api.md. */
+interface Where {
+  /** An id or `id@version`. */
+  map: string;
+  options?: Record<string, string | number>;
+  /** What is known of the place beforehand. */
+  priors?: unknown;
+}
+
+export interface LocalizeCall extends Where, Asked {
+  /** The photo's file, for people who read the service's log. */
+  name?: string;
+  /** Whether the answer shall contain the matches and a picture of them. */
+  debug?: boolean;
+}
+
+export interface RigImage extends Asked {
+  /** A camera of the rig. */
+  sensor: string;
+  timestamp?: number;
+}
+
+export interface RigCall extends Where {
+  /** The id of a rig that the map knows, or where each camera sits. */
+  rig: string | { sensors: Record<string, { cam_from_rig: Transform; camera?: Camera }> };
+  images: RigImage[];
+}
+
+/** The form of POST /localize. What was not chosen is not sent: the service has defaults. */
+export function localizeForm(call: LocalizeCall): FormData {
+  const form = new FormData();
+  form.set("map", call.map);
+  if (call.image !== undefined) form.set("image", blobOf(call.image), call.name || "photo");
+  if (call.mask !== undefined) form.set("mask", blobOf(call.mask), "mask");
+  if (call.features !== undefined) {
+    const file = new Blob([JSON.stringify(featuresJson(call.features))]);
+    form.set("features", file, "features.json");
+  }
+  if (call.camera != null) form.set("camera", cameraText(call.camera));
+  if (call.options !== undefined && Object.keys(call.options).length > 0) {
+    form.set("options", JSON.stringify(call.options));
+  }
+  if (call.priors !== undefined) form.set("priors", JSON.stringify(call.priors));
+  if (call.debug === true) form.set("debug", "true");
+  return form;
+}
+
+/** The form of POST /localize/rig: a text `request`, and a file for each photo and mask. */
+export function rigForm(call: RigCall): FormData {
+  const form = new FormData();
+  let files = 0;
+  const part = (photo: Photo): string => {
+    const name = `image${files++}`;
+    form.set(name, blobOf(photo), "photo");
+    return name;
+  };
+  const images = call.images.map(({ image, mask, features, camera, ...rest }) => ({
+    ...rest,
+    ...(image === undefined ? {} : { part: part(image) }),
+    ...(mask === undefined ? {} : { mask_part: part(mask) }),
+    ...(features === undefined ? {} : { features: featuresJson(features) }),
+    ...(camera == null ? {} : { camera }),
+  }));
+  form.set("request", JSON.stringify({ ...call, images }));
+  return form;
+}
+
+const blobOf = (photo: Photo): Blob => (photo instanceof Blob ? photo : new Blob([photo]));
+
+function featuresJson({ kind, keypoints, descriptors, global_descriptors }: Features): unknown {
+  const count = keypoints.length / 2;
+  const described = Object.entries(global_descriptors).map(([name, numbers]): [string, unknown] => [
+    name,
+    arrayJson(numbers, [numbers.length]),
+  ]);
+  return {
+    kind,
+    keypoints: arrayJson(keypoints, [count, 2]),
+    descriptors: arrayJson(descriptors, [count, count > 0 ? descriptors.length / count : 0]),
+    global_descriptors: Object.fromEntries(described),
+  };
+}
+
+/** Little-endian, as every machine that runs JavaScript is. */
+function arrayJson(numbers: FeatureArray, shape: number[]): unknown {
+  const dtype =
+    numbers instanceof Float32Array ? "float32" : numbers instanceof Int8Array ? "int8" : "uint8";
+  const bytes = new Uint8Array(numbers.buffer, numbers.byteOffset, numbers.byteLength);
+  let text = "";
+  // A function takes some ten thousand arguments at most.
+  for (let at = 0; at < bytes.length; at += 8192) {
+    text += String.fromCharCode(...bytes.subarray(at, at + 8192));
+  }
+  return { dtype, shape, data: btoa(text) };
+}
