@@ -1,6 +1,6 @@
 """Localize queries in a map without landmarks, or in any other: for the first time, and again.
 
-    python -m benchmarks.local_sfm MAPS MAP QUERY [EVERY]
+    python -m benchmarks.local_sfm MAPS MAP QUERY [--every EVERY]
 
 MAPS is a folder of maps, QUERY a kapture dataset of which every EVERYth photo is asked, twice: the
 first time may triangulate; the second time, its place is known.

@@ -151,12 +151,14 @@ class MapGeometry:
         """Median distance from photos to the landmarks that they see, in units of the world."""
         num_photos = len(self.centers)
         distances = []
+        offsets = self.opened.observation_offsets
         most = _NUM_REACH_PHOTOS if self._local is None else _NUM_REACH_TRIANGULATED
         for photo in range(0, num_photos, max(1, num_photos // most)):
-            seen, _ = self.observed(photo)
-            points = self.points(seen[:: max(1, len(seen) // _NUM_REACH_LANDMARKS)])
-            if len(points):
-                away = points.astype(np.float64) - self.centers[photo]
+            start, stop = int(offsets[photo]), int(offsets[photo + 1])
+            step = max(1, (stop - start) // _NUM_REACH_LANDMARKS)
+            points = self.points(self.opened.observation_landmarks[start:stop:step])
+            away = points[np.isfinite(points[:, 0])].astype(np.float64) - self.centers[photo]
+            if len(away):
                 distances.append(float(np.median(np.linalg.norm(away, axis=1))))
         return float(np.median(distances)) if distances else 0.0
 

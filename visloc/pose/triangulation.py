@@ -40,13 +40,13 @@ def triangulated(
     Returns:
         (k, 3) points in the world; NaN where there is none.
     """
-    seen = np.isfinite(rays).all(axis=2)
+    seen: NDArray[np.bool_] = np.asarray(np.isfinite(rays).all(axis=2))
     rays = np.where(seen[:, :, None], rays, 0.0)
     points = np.full((len(rays), 3), np.nan)
     counts = np.zeros(len(rays), dtype=np.int64)
     least_errors = np.full(len(rays), np.inf)
-    cosines: NDArray[np.float64] = np.einsum("kvi,ki->kv", rays, rays[:, 0])
-    wide = np.less_equal(cosines, np.cos(min_angle), out=np.empty(seen.shape, np.bool_))
+    cosines = np.einsum("kvi,ki->kv", rays, rays[:, 0])
+    wide: NDArray[np.bool_] = np.asarray(cosines <= np.cos(min_angle))
     for other in range(1, len(centers)):
         rows = np.flatnonzero(seen[:, 0] & seen[:, other] & wide[:, other])
         proposed = _where_two_meet(rays[rows, 0], rays[rows, other], centers[0], centers[other])
