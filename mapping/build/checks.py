@@ -45,6 +45,8 @@ def check_settings(settings: BuildSettings) -> None:
     _check_global_features(settings)
     _check_lengths(settings)
     _check_sfm(settings)
+    if settings.keep_colours and settings.method == "retrieval-only":
+        raise refuse("build.keep_colours", field="--keep-colours")
 
 
 def check_names(option: str, names: Sequence[str], known: Sequence[str]) -> None:

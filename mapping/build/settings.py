@@ -43,7 +43,7 @@ from visloc.retrieval.index import MAX_EXACT, IndexKind
 
 _cluster_option = partial(typer.Option, rich_help_panel=CLUSTER_PANEL)
 
-METHODS = ("rgbd", "sfm", "model")
+METHODS = ("rgbd", "sfm", "model", "retrieval-only")
 
 
 def _weights_in(text: str) -> Mapping[str, float]:
@@ -74,7 +74,8 @@ class BuildSettings:
         str,
         typer.Option(
             help="Source of the landmarks. rgbd: depth maps. sfm: triangulated matches. model: "
-            "points that come with the dataset."
+            "points that come with the dataset. retrieval-only: none; queries triangulate around "
+            "themselves."
         ),
     ] = METHODS[0]
     local_features: AnyLocalFeaturesOption = DEFAULT_LOCAL_FEATURES

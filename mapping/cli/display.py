@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import resource
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -50,7 +50,7 @@ def summary_of(opened: Map) -> dict[str, Any]:
         **manifest,
         "size_bytes": opened.size_bytes,
         "bytes_per_observation": opened.size_bytes / counts["observations"],
-        "mean_track_length": float(opened.track_lengths.mean()),
+        "mean_track_length": float(opened.track_lengths.mean()) if opened.has_landmarks else None,
         "cameras": len(opened.cameras),
         "focal_lengths": {name: asdict(one) for name, one in cameras_of(opened).items()},
         "rigs": {rig: sorted(members) for rig, members in opened.rigs.items()},
@@ -95,8 +95,7 @@ def print_map(opened: Map) -> None:
         "cameras": "\n".join(camera_lines(opened)),
         "rigs": "; ".join(f"{rig}: {', '.join(names)}" for rig, names in summary["rigs"].items())
         or "none",
-        "landmarks": f"{counts['landmarks']}, seen by {summary['mean_track_length']:.1f} photos "
-        "in the mean",
+        "landmarks": _landmarks(summary),
         "observations": f"{counts['observations']}",
         "local features": f"{local['fingerprint']['name']}, {local['descriptor_dim']} dimensions, "
         f"at most {local['max_keypoints']} per photo",
@@ -123,6 +122,15 @@ def print_map(opened: Map) -> None:
         table.add_row(name, escape(value))
     OUT.print(table)
     say_notes(summary["notes"])
+
+
+def _landmarks(summary: Mapping[str, Any]) -> str:
+    if summary["mean_track_length"] is None:
+        return "none: queries triangulate around themselves"
+    return (
+        f"{summary['counts']['landmarks']}, seen by {summary['mean_track_length']:.1f} photos in "
+        "the mean"
+    )
 
 
 def print_pieces(store: MapStore, largest: Map) -> None:

@@ -21,6 +21,7 @@ from mapping.cli.display import ERR, OUT, say
 from mapping.cli.progress import StageProgress
 from mapping.cluster.storage import is_map_folder, map_folder
 from mapping.cluster.workers import DEFAULT_WORKERS, Workers
+from mapping.methods.retrieval_only import refuse_without_landmarks
 from mapping.options import MapArgument, MapsDirOption
 from mapping.progress import Progress
 from mapping.report import make_report_data
@@ -98,10 +99,11 @@ def write_report(
         The contents of the report: ``ReportData`` of ``web/src/report/data.ts``.
 
     Raises:
-        Conflict: ``report.output`` or ``report.work`` if nothing can be written there;
-            ``report.running``.
+        Conflict: ``map.no_landmarks``; ``report.output`` or ``report.work`` if nothing can be
+            written there; ``report.running``.
         Unavailable: ``page.not_built``.
     """
+    refuse_without_landmarks(opened)
     # Errors that would come at the end are provoked before the long work.
     script, style = report_parts()
     unfinished = _begun(target)

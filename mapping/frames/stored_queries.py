@@ -25,7 +25,7 @@ from visloc.types import CameraSource, Evidence
 def match_stored(
     source: Map,
     image: int,
-    target: Map,
+    target: MapGeometry,
     photos: Iterable[int],
     without: NDArray[np.integer] | None = None,
     features: NDArray[np.int64] | None = None,
@@ -35,19 +35,18 @@ def match_stored(
     Args:
         source: the map that keeps the photo.
         image: its row there.
-        target: the map that is asked; may be the same.
+        target: of the map that is asked; may be the same.
         photos: rows of its photos, most similar first.
         without: (k,) landmarks that it is not to have; None for none.
         features: (m,) rows of the photo's features that count; None for all.
     """
-    scale = target.manifest.local_features.descriptor_scale
 
     def observed(photo: int) -> tuple[NDArray[np.integer], EightBitRows]:
-        landmarks, descriptors = target.observations(photo)
+        landmarks, descriptors = target.observed(photo)
         if without is None:
-            return landmarks, EightBitRows(descriptors, scale)
+            return landmarks, descriptors
         there = ~np.isin(landmarks, without)
-        return landmarks[there], EightBitRows(descriptors[there], scale)
+        return landmarks[there], EightBitRows(descriptors.rows[there], descriptors.scale)
 
     own_scale = source.manifest.local_features.descriptor_scale
     descriptors = source.observations(image)[1]
@@ -61,7 +60,6 @@ def match_stored(
 def solve_stored(
     source: Map,
     image: int,
-    target: Map,
     geometry: MapGeometry,
     matched: Correspondences,
     options: LocalizeOptions,
@@ -71,12 +69,12 @@ def solve_stored(
     Args:
         source: the map that keeps the photo.
         image: its row there.
-        target: the map that is asked.
+        geometry: of the map that is asked.
         matched: what ``match_stored`` found.
         options: thresholds and the seed.
     """
     pixels = source.keypoints(image)[matched.keypoints].astype(np.float64)
-    points = target.landmarks[matched.landmarks].astype(np.float64)
+    points = geometry.points(matched.landmarks).astype(np.float64)
     evidence = Evidence(
         source.cameras[source.images[image].camera],
         CameraSource.GIVEN,

@@ -18,6 +18,7 @@ from mapping.maps.colmap_database import (
     write_colmap_database,
 )
 from mapping.maps.colmap_queries import match_queries
+from mapping.methods.retrieval_only import refuse_without_landmarks
 from mapping.stages.imported_points import ImportedPoints, read_imported_points
 from mapping.stages.landmarks import Observations, View, reprojection_errors
 from mapping.stages.outputs import complete_output
@@ -81,7 +82,7 @@ def export_map(
     Raises:
         InvalidInput: ``export.unknown_format``; ``export.queries`` for another format, or for a map
             of an imported reconstruction whose points are not those that queries are matched with.
-        Conflict: ``export.exists``.
+        Conflict: ``export.exists``; ``map.no_landmarks``.
         DatasetError: ``kapture.field`` for a name that kapture cannot hold.
     """
     export = EXPORTERS.get(format_name)
@@ -91,6 +92,7 @@ def export_map(
         format_name != "colmap" or read_imported_points(opened) is not None
     ):
         raise refuse("export.queries", field="--queries", got=f"{format_name} of {opened.ref}")
+    refuse_without_landmarks(opened)
     with complete_output(output, "export.exists") as partial:
         notes = export(opened, partial)
         if format_name == "colmap":

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from mapping.maps.editing import content_of, selected
 from mapping.maps.sets import Progress, publish_set, refuse_map_of_this_name, same_content
 from mapping.methods.pieces import MIN_PHOTOS
+from mapping.methods.retrieval_only import refuse_without_landmarks
 from mapping.own_test.publishing import refuse_not_accepted
 from mapping.stages.publishing import new_version, photo_files
 from visloc.archive import Map, MapContent, MapStore, write_map
@@ -71,12 +72,14 @@ def split_map(
 
     Raises:
         InvalidInput: ``split.tile``, ``split.overlap``; ``map.is_set`` for a set.
-        Conflict: ``map.doubtful`` for a version in doubt that is not in use; ``set.id_is_map``;
+        Conflict: ``map.no_landmarks``; ``map.doubtful`` for a version in doubt that is not in use;
+            ``set.id_is_map``;
             ``split.map_exists`` when a map that is none of these tiles has the id of one; and what
             ``publish_set`` raises.
     """
     checked_name(set_id, "set")
     opened = open_published(store.folder(ref))
+    refuse_without_landmarks(opened)
     refuse_not_accepted(store, opened)  # tiles have no test of their own
     refuse_map_of_this_name(store, set_id, "--set")
     cuts = cut(opened, tile, overlap)

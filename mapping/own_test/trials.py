@@ -79,7 +79,8 @@ def run_own_test(opened: Map) -> OwnTestRun:
     The photos are spread evenly and every random choice has a seed, so that equal maps have equal
     tests.
     """
-    viewpoints, geometry = MapGeometry(opened).viewpoints, MapGeometry(opened)
+    geometry = MapGeometry(opened)
+    viewpoints = geometry.viewpoints
     most = min(max(_LEAST_PHOTOS, len(opened.images) // _SHARE_OF_PHOTOS), _MOST_PHOTOS)
     images = spread_photos(len(opened.images), most)
     tested, trials, localized, refused = 0, [], [], []
@@ -167,8 +168,10 @@ def _trial(
     options = LocalizeOptions(top_k=_PHOTOS_ASKED)
     num = len(opened.observations(image)[0])
     rows = np.random.default_rng(image).permutation(num)[:_MOST_KEYPOINTS]
-    matched = match_held_out(opened, image, left_out, options, np.sort(rows))
-    solved = solve_stored(opened, image, opened, geometry, matched, options)
+    if not opened.has_landmarks:
+        geometry = geometry.without(left_out)
+    matched = match_held_out(geometry, image, left_out, options, np.sort(rows))
+    solved = solve_stored(opened, image, geometry, matched, options)
     if solved.pose is None or solved.pose.covariance is None:
         return None
     found, true = solved.pose.rig_from_world, viewpoints.pose(image)

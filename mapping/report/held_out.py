@@ -173,14 +173,15 @@ def localize_held_out(
     options = LocalizeOptions()
     camera = opened.cameras[opened.images[image].camera]
     pose = viewpoints.pose(image)
-    matched = match_held_out(opened, image, left_out, options)
+    geometry = MapGeometry(opened)
+    matched = match_held_out(geometry, image, left_out, options)
     pixels = opened.keypoints(image)[matched.keypoints].astype(np.float64)
     points = opened.landmarks[matched.landmarks].astype(np.float64)
     view = MatchedView(camera, Pose.identity(), pixels, points)
     errors_px = reprojection_errors(view, pose) if len(view) else np.empty(0)
     correct = errors_px <= registration_for(options, [camera]).max_error_px  # False for NaN
 
-    solved = solve_stored(opened, image, opened, MapGeometry(opened), matched, options)
+    solved = solve_stored(opened, image, geometry, matched, options)
     refusal, position_error, orientation_error = solved.answer.refusal, np.inf, np.inf
     if refusal is None and solved.pose is not None:
         position_error, orientation_error = pose_error(solved.pose.rig_from_world, pose)
@@ -220,7 +221,7 @@ def too_seldom_seen(opened: Map, seen: NDArray[np.integer]) -> NDArray[np.int64]
 
 
 def match_held_out(
-    opened: Map,
+    geometry: MapGeometry,
     image: int,
     left_out: NDArray[np.int64],
     options: LocalizeOptions,
@@ -229,19 +230,20 @@ def match_held_out(
     """Match a photo's features with a map without some of its photos, as the localizer does.
 
     Args:
-        opened: the map.
+        geometry: of the map; of one without landmarks, ``MapGeometry.without`` these photos.
         image: row of the photo.
         left_out: (k,) rows of the photos that the map is not to have.
         options: how many photos are asked.
         features: (m,) rows of the photo's features that count; None for all.
     """
+    opened = geometry.opened
     remaining = np.ones(len(opened.images))
     remaining[left_out] = 0.0
     rows = opened.global_descriptors
     query = {name: rows[name][image] for name in opened.fusion.counted(rows)}
     retrieved = retrieve(query, rows, options.top_k, remaining, opened.fusion)
-    gone = vanishing(opened, left_out)
-    return match_stored(opened, image, opened, retrieved.images.tolist(), gone, features)
+    gone = vanishing(opened, left_out) if opened.has_landmarks else None
+    return match_stored(opened, image, geometry, retrieved.images.tolist(), gone, features)
 
 
 def _key(opened: Map, image: int) -> str:

@@ -167,8 +167,9 @@ def _ask(opened: Map, viewpoints: Viewpoints, image: int) -> Item:
     own_place, options = shares_place(opened, viewpoints, image), LocalizeOptions()
     twin, position, inliers = np.empty(0, np.int64), np.empty((0, 3)), np.empty(0, np.int64)
     if not own_place.all():
-        matched = match_held_out(opened, image, np.flatnonzero(own_place), options)
-        solved = solve_stored(opened, image, opened, MapGeometry(opened), matched, options)
+        geometry = MapGeometry(opened)
+        matched = match_held_out(geometry, image, np.flatnonzero(own_place), options)
+        solved = solve_stored(opened, image, geometry, matched, options)
         if solved.pose is not None:
             pose = solved.pose.rig_from_world
             apart = viewpoints.apart_from(pose)

@@ -132,6 +132,21 @@ def assemble_landmarks(
     return landmarks, [observations.rows[a:b] for a, b in pairwise(bounds.tolist())]
 
 
+def only_observations(views: Sequence[View], keypoints: Sequence[NDArray[np.float32]]) -> Landmarks:
+    """Return what a map without landmarks stores: each keypoint (m_i, 2) of each view."""
+    offsets = np.cumsum([0, *map(len, keypoints)])
+    return Landmarks(
+        origin=_choose_origin(views),
+        points=np.empty((0, 3), np.float32),
+        track_lengths=np.empty(0, np.uint16),
+        errors_px=np.empty(0, np.float32),
+        angles_deg=np.empty(0, np.float32),
+        offsets=offsets.astype(np.int64),
+        observed=np.arange(offsets[-1], dtype=np.uint32),
+        keypoints=np.concatenate(keypoints),
+    )
+
+
 def reprojection_errors(
     views: Sequence[View], points: NDArray[np.float64], observations: Observations
 ) -> NDArray[np.float64]:

@@ -55,6 +55,7 @@ class Place:
             image_poses=np.hstack([identity, -(local + self.origin)]),
             landmarks=(local + np.array([0.0, 0.0, 5.0])).astype(np.float32),
             observation_offsets=np.arange(len(local) + 1),
+            has_landmarks=True,
             observation_landmarks=np.arange(len(local)),
         )
         return MapGeometry(opened)

@@ -208,7 +208,7 @@ def map_array(
     """
     path = folder / name
     found, offset, order = _array_header(path, dtype, shape, before)
-    if load:
+    if load or 0 in shape:  # nothing cannot be mapped into memory
         try:
             values = np.fromfile(path, found, math.prod(shape), offset=offset)
         except OSError as error:

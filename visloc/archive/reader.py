@@ -115,7 +115,8 @@ class Map(MapOutline):
             computed.
         colors: (P, 3) uint8 RGB; None when the map has none.
         observation_offsets: (n + 1,) int64; rows offsets[i]:offsets[i + 1] belong to photo i.
-        observation_landmarks: (M,) uint32 rows of ``landmarks``.
+        observation_landmarks: (M,) uint32 rows of ``landmarks``; its own row in a map that has no
+            landmarks.
         observation_descriptors: (M, D) int8, in steps of the manifest's ``descriptor_scale``.
         observation_keypoints: (M, 2) int16 or float32; ``keypoints`` reads them as pixels.
         global_descriptors: unit rows (n, D) by name.
@@ -144,6 +145,11 @@ class Map(MapOutline):
         """
         start, stop = self.observation_offsets[image], self.observation_offsets[image + 1]
         return self.observation_landmarks[start:stop], self.observation_descriptors[start:stop]
+
+    @property
+    def has_landmarks(self) -> bool:
+        """Whether it stores landmarks; queries triangulate those of another one."""
+        return self.manifest.counts.landmarks > 0
 
     @property
     def has_index(self) -> bool:
@@ -265,7 +271,7 @@ def verify_map(folder: Path) -> Map:
         "image_poses.npy": is_finite(opened.image_poses) and _are_unit(opened.image_poses[:, :4]),
         "landmarks.npy": is_finite(opened.landmarks),
         "observation_offsets.npy": _lead_through(opened.observation_offsets, counts.observations),
-        "observation_landmarks.npy": int(opened.observation_landmarks.max()) < counts.landmarks,
+        "observation_landmarks.npy": _name_landmarks(opened),
         "observation_keypoints.npy": is_finite(opened.observation_keypoints),
     }
     for record in opened.manifest.global_features:
@@ -284,6 +290,12 @@ def verify_map(folder: Path) -> Map:
         if not good:
             raise refuse("map.range", field=str(folder / name))
     return opened
+
+
+def _name_landmarks(opened: Map) -> bool:
+    """Whether each observation is of a landmark that is there, or of its own where none is."""
+    named, num = opened.observation_landmarks, opened.manifest.counts.landmarks
+    return int(named.max()) < num if num else bool((named == np.arange(len(named))).all())
 
 
 def _map_rows(folder: Path, record: GlobalFeaturesRecord, num_images: int) -> GlobalRows:

@@ -24,7 +24,7 @@ from visloc.retrieval.fusion import LateFusion
 from visloc.types import Fingerprint
 
 FORMAT = "visloc-map"
-FORMAT_MAJOR, FORMAT_MINOR = 3, 1
+FORMAT_MAJOR, FORMAT_MINOR = 3, 2
 
 ID_PATTERN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 # Names of a map's files: a path below the map on every operating system.
@@ -222,10 +222,14 @@ class World(Record):
 
 
 class Counts(Record):
-    """Numbers of photos, landmarks and observations."""
+    """Numbers of photos, landmarks and observations.
+
+    Without landmarks, which format 3.2 allows, each observation stands for one of its own, and
+    queries triangulate them.
+    """
 
     images: Annotated[int, Field(ge=1)]
-    landmarks: Annotated[int, Field(ge=1)]
+    landmarks: Annotated[int, Field(ge=0)]
     observations: Annotated[int, Field(ge=1)]
 
 

@@ -321,7 +321,8 @@ def _within_float16(values: NDArray[Any]) -> NDArray[Any]:
 
 def _world(content: MapContent) -> dict[str, Any]:
     landmarks = content.landmarks
-    low, high = landmarks.points.min(axis=0), landmarks.points.max(axis=0)
+    points = landmarks.points if len(landmarks.points) else _centers(content)
+    low, high = points.min(axis=0), points.max(axis=0)
     world: dict[str, Any] = {
         "metric": content.metric,
         "origin": landmarks.origin.tolist(),
@@ -335,6 +336,13 @@ def _world(content: MapContent) -> dict[str, Any]:
     if content.gravity is not None:
         world["gravity"] = list(content.gravity)
     return world
+
+
+def _centers(content: MapContent) -> NDArray[np.float64]:
+    """Return the camera centres (n, 3) of the photos, relative to the origin."""
+    rows = content.image_poses
+    centers = [Pose.from_quaternion(row[:4], row[4:]).center for row in rows]
+    return np.asarray(centers - content.landmarks.origin)
 
 
 def _write_images(files: Files, content: MapContent) -> None:

@@ -188,7 +188,7 @@ class CoarsePoses:
         turns = [image.turn for image in self._geometry.opened.images]
         upright = {turn: _upright_from_stored(turn, 0) for turn in set(turns)}
         stacked = np.stack([upright[turn] for turn in turns])
-        return np.asarray(stacked @ self._geometry.viewpoints.rotations)
+        return np.asarray(stacked @ self._geometry.rotations)
 
 
 def _upright_from_stored(exif_orientation: int, turned: int) -> _Matrix:

@@ -18,6 +18,7 @@ from visloc.archive import Manifest, Map
 from visloc.errors import refuse
 from visloc.features.resolution import Resolution, WorkingResolution
 from visloc.geometry import Pose
+from visloc.localization.local_model import LocalModel
 from visloc.localization.viewpoints import Viewpoints
 from visloc.matching.products import EightBitRows
 from visloc.pose.centre import largest_std, with_origin
@@ -38,6 +39,8 @@ _MAX_MAHALANOBIS2 = 27.86
 _MAX_DOWN_DIFFERENCE = math.radians(5.0)
 _LEAST_TANGENT = 1e-12  # of the angle between a ray and the camera's axis
 _NUM_REACH_PHOTOS, _NUM_REACH_LANDMARKS = 100, 200
+# Of a map without landmarks: each photo takes a tenth of a second.
+_NUM_REACH_TRIANGULATED = 10
 
 
 def _errors_of(manifest: Manifest) -> MapErrors:
@@ -69,6 +72,9 @@ class MapGeometry:
         self.opened = opened
         self.origin = np.array(opened.manifest.world.origin)
         self.down = opened.gravity
+        self._local: LocalModel | None = None
+        if not opened.has_landmarks:
+            self._local = LocalModel(opened, self.centers, self.rotations)
         self.errors = _errors_of(opened.manifest)
 
     @property
@@ -83,13 +89,30 @@ class MapGeometry:
     def observed(self, row: int) -> tuple[NDArray[np.integer], EightBitRows]:
         """Return the landmarks (m,) that a photo sees, and their descriptors."""
         landmarks, descriptors = self.opened.observations(int(row))
+        if self._local is not None:
+            placed = np.isfinite(self._local.of_photo(int(row))[:, 0])
+            landmarks, descriptors = landmarks[placed], descriptors[placed]
         return landmarks, EightBitRows(
             descriptors, self.opened.manifest.local_features.descriptor_scale
         )
 
     def points(self, landmarks: NDArray[np.integer]) -> NDArray[np.float32]:
-        """Return landmarks (n, 3), relative to the origin."""
-        return np.asarray(self.opened.landmarks[landmarks])
+        """Return landmarks (n, 3), relative to the origin.
+
+        NaN for those of a map without landmarks that cannot be triangulated.
+        """
+        if self._local is not None:
+            return self._local.points(landmarks)
+        return np.asarray(np.take(self.opened.landmarks, landmarks, axis=0))
+
+    def without(self, photos: NDArray[np.int64]) -> MapGeometry:
+        """Return the same of a map without landmarks that does not have some photos (k,)."""
+        if self._local is None:
+            raise AssertionError("the landmarks of this map were made of all its photos")
+        geometry = MapGeometry(self.opened)
+        geometry._local = self._local.without(photos)
+        geometry.reach = self.reach
+        return geometry
 
     def nearest_photos(self, row: int, count: int) -> NDArray[np.int64]:
         """Return the photos taken most like one of them, itself first."""
@@ -100,8 +123,7 @@ class MapGeometry:
     @cached_property
     def viewpoints(self) -> Viewpoints:
         """Where the photos were taken, and which way they look, relative to the origin."""
-        rotations = Rotation.from_quat(self.opened.image_poses[:, :4], scalar_first=True)
-        return Viewpoints(self.centers, rotations.as_matrix(), max(self.reach, _LEAST_REACH))
+        return Viewpoints(self.centers, self.rotations, max(self.reach, _LEAST_REACH))
 
     @cached_property
     def resolution(self) -> WorkingResolution:
@@ -110,6 +132,12 @@ class MapGeometry:
         photos = [cameras[image.camera] for image in self.opened.images]
         features = self.opened.manifest.local_features.fingerprint
         return WorkingResolution.of(photos, features.parameters)
+
+    @cached_property
+    def rotations(self) -> NDArray[np.float64]:
+        """(n, 3, 3) cameras of the photos from the world."""
+        rotations = Rotation.from_quat(self.opened.image_poses[:, :4], scalar_first=True)
+        return np.asarray(rotations.as_matrix())
 
     @cached_property
     def centers(self) -> NDArray[np.float64]:
@@ -124,12 +152,13 @@ class MapGeometry:
         num_photos = len(self.centers)
         distances = []
         offsets = self.opened.observation_offsets
-        for photo in range(0, num_photos, max(1, num_photos // _NUM_REACH_PHOTOS)):
+        most = _NUM_REACH_PHOTOS if self._local is None else _NUM_REACH_TRIANGULATED
+        for photo in range(0, num_photos, max(1, num_photos // most)):
             start, stop = int(offsets[photo]), int(offsets[photo + 1])
             step = max(1, (stop - start) // _NUM_REACH_LANDMARKS)
-            seen = self.opened.observation_landmarks[start:stop:step]
-            if len(seen):
-                away = self.opened.landmarks[seen].astype(np.float64) - self.centers[photo]
+            points = self.points(self.opened.observation_landmarks[start:stop:step])
+            away = points[np.isfinite(points[:, 0])].astype(np.float64) - self.centers[photo]
+            if len(away):
                 distances.append(float(np.median(np.linalg.norm(away, axis=1))))
         return float(np.median(distances)) if distances else 0.0
 

@@ -338,7 +338,7 @@ def _expected(
     seen = [_some_rows(opened.observation_offsets, image) for image in nearest.tolist()]
     observations, photos = np.concatenate(seen), np.repeat(nearest, [len(each) for each in seen])
     landmarks = np.asarray(opened.observation_landmarks)[observations].astype(np.int64)
-    points = np.take(opened.landmarks, landmarks, axis=0).astype(np.float64)
+    points = geometry.points(landmarks).astype(np.float64)
     in_cam = cam_from_world.apply(points)
     pixels = project(camera, in_cam)
     (x, y), (width, height) = pixels.T, (camera.width, camera.height)

@@ -345,7 +345,7 @@ class Localizer:
         if options.matcher is Matcher.LIGHTGLUE:
             network = self._make_matcher(self.map.manifest.local_features.fingerprint.name)
             seen = seen_as_found(local, evidence, features.reduced)
-            rematching = Rematching(network, self.map, seen)
+            rematching = Rematching(network, self.geometry, seen)
         evidence = replace(evidence, num_keypoints=len(local))
         if len(local) == 0:
             why = "no keypoints were found: the photo is blank, dark, blurred or too small"
@@ -379,7 +379,7 @@ class Localizer:
             ratio = CLEAR_RATIO if options.matcher is Matcher.RATIO else None
             pairs = self._match_photos(shown, retrieved.images, ratio, rematching)
             others = self._match_photos(shown, elsewhere, ratio, rematching)
-        matched, points = pairs.settled(), self.map.landmarks[pairs.landmarks]
+        matched, points = pairs.settled(), self.geometry.points(pairs.landmarks)
         matches = self._matches(shown, matched)
         evidence = replace(evidence, num_correspondences=len(matches.pixels))
         return Look(
@@ -411,7 +411,7 @@ class Localizer:
     def _matches(self, shown: Shown, pairs: Correspondences) -> Matches:
         return Matches(
             shown.keypoints[pairs.keypoints].astype(np.float64),
-            self.map.landmarks[pairs.landmarks].astype(np.float64),
+            self.geometry.points(pairs.landmarks).astype(np.float64),
         )
 
     def _describe(self, name: str, features: _Features) -> NDArray[np.float32]:

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.archive import Map
 from visloc.features.framing import turned_points, turned_size
 from visloc.features.networks.lightglue.model import SeenKeypoints
 from visloc.geometry import Camera
 from visloc.images import turn_of, upright_from_stored
+from visloc.localization.constraints import MapGeometry
 from visloc.matching.correspondences import Pairs
 from visloc.options import ReadAs
 from visloc.types import Evidence, LocalFeatures
@@ -27,12 +27,12 @@ class Rematching:
 
     Attributes:
         network: of the map's local features.
-        opened: the map.
+        geometry: of the map.
         seen: keypoints of the photo, as ``seen_as_found`` gives them.
     """
 
     network: LightGlue
-    opened: Map
+    geometry: MapGeometry
     seen: SeenKeypoints
 
     def match(self, image: int) -> Pairs:
@@ -41,16 +41,19 @@ class Rematching:
         Returns:
             Keypoints, landmarks, and the cosine similarities of their descriptors.
         """
-        landmarks, rows = self.opened.observations(image)
-        record = self.opened.images[image]
-        scale = np.float32(self.opened.manifest.local_features.descriptor_scale)
+        opened = self.geometry.opened
+        landmarks, rows = opened.observations(image)
+        record = opened.images[image]
+        scale = np.float32(opened.manifest.local_features.descriptor_scale)
         theirs = _seen_upright(
-            self.opened.keypoints(image),
+            opened.keypoints(image),
             rows.astype(np.float32) * scale,
-            self.opened.cameras[record.camera],
+            opened.cameras[record.camera],
             record.turn,
         )
         i, j, _ = self.network.match(self.seen, theirs)
+        placed = np.isfinite(self.geometry.points(landmarks[j])[:, 0])
+        i, j = i[placed], j[placed]
         similarities = np.einsum("nd,nd->n", self.seen.descriptors[i], theirs.descriptors[j])
         return i, landmarks[j].astype(np.int64), similarities
 

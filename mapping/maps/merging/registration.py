@@ -119,8 +119,8 @@ def _seen(
     for done, image in enumerate(tried):
         progress(done, len(tried))
         alike = np.argsort(-(rows @ own_rows[image]), kind="stable")[: options.top_k]
-        matched = match_stored(source, image, target, alike.tolist())
-        solved = solve_stored(source, image, target, geometry, matched, options)
+        matched = match_stored(source, image, geometry, alike.tolist())
+        solved = solve_stored(source, image, geometry, matched, options)
         if solved.answer.refusal is not None or solved.pose is None:
             continue
         inliers, local = solved.inliers[0], solved.pose.rig_from_world

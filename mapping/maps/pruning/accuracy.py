@@ -128,11 +128,11 @@ def of_held_out_photos(
         left_out = sets[min(1, len(sets) - 1)]
         gone = vanishing(before, left_out)
         there, gone_there = photo_rows[left_out], landmark_rows[gone]
-        for own, geometry, target, photos, landmarks in (
-            (errors[0], geometries[0], before, left_out, gone),
-            (errors[1], geometries[1], after, there[there >= 0], gone_there[gone_there >= 0]),
+        for own, geometry, photos, landmarks in (
+            (errors[0], geometries[0], left_out, gone),
+            (errors[1], geometries[1], there[there >= 0], gone_there[gone_there >= 0]),
         ):
-            found = _localized(before, image, target, geometry, photos, landmarks)
+            found = _localized(before, image, geometry, photos, landmarks)
             if found is not None:
                 own.append(pose_error(found, viewpoints.pose(image)))
     progress(len(chosen), len(chosen))
@@ -142,11 +142,11 @@ def of_held_out_photos(
 def _localized(
     source: Map,
     image: int,
-    target: Map,
     geometry: MapGeometry,
     left_out: NDArray[np.int64],
     gone: NDArray[np.int64],
 ) -> Pose | None:
+    target = geometry.opened
     remaining = np.ones(len(target.images))
     remaining[left_out] = 0.0
     if not remaining.any():
@@ -154,8 +154,8 @@ def _localized(
     options, rows = LocalizeOptions(), source.global_descriptors
     query = {name: rows[name][image] for name in source.fusion.counted(rows)}
     retrieved = retrieve(query, target.global_descriptors, options.top_k, remaining, source.fusion)
-    matched = match_stored(source, image, target, retrieved.images.tolist(), gone)
-    solved = solve_stored(source, image, target, geometry, matched, options)
+    matched = match_stored(source, image, geometry, retrieved.images.tolist(), gone)
+    solved = solve_stored(source, image, geometry, matched, options)
     if solved.answer.refusal is not None or solved.pose is None:
         return None
     return solved.pose.rig_from_world

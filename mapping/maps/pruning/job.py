@@ -9,6 +9,7 @@ from functools import partial
 from mapping.maps.editing import content_of, selected
 from mapping.maps.pruning.accuracy import Accuracy, of_held_out_photos
 from mapping.maps.pruning.choosing import LEFT_OUT, Kept, choose, least, num_landmarks, size_with
+from mapping.methods.retrieval_only import refuse_without_landmarks
 from mapping.own_test.publishing import publish_tested, write_content
 from mapping.stages.publishing import link_photos, photo_files
 from mapping.stages.work_folder import exclusive
@@ -56,9 +57,11 @@ def prune_map(
 
     Raises:
         InvalidInput: ``prune.too_small`` with the least that is possible.
-        Conflict: ``prune.small_already``; ``map.outdated``; ``build.running``.
+        Conflict: ``map.no_landmarks``; ``prune.small_already``; ``map.outdated``;
+            ``build.running``.
     """
     before = store.open(map_ref)
+    refuse_without_landmarks(before)
     map_id, named = before.manifest.id, before.manifest.version
     with exclusive(store.root / ".work" / f"{map_id}.lock"):
         if (current := store.current_version(map_id)) != named:

@@ -38,6 +38,7 @@ from mapping.maps.updating.settings import (
     refuse_few,
     refuse_strange_settings,
 )
+from mapping.methods.retrieval_only import refuse_without_landmarks
 from mapping.methods.rgbd import (
     DepthSettings,
     landmarks_from_depth,
@@ -132,6 +133,7 @@ def update_map(settings: UpdateSettings, progress: Progress) -> Updated:
     check_settings(settings)
     store = MapStore(settings.maps_dir)
     opened = open_map(map_folder(settings.map_ref, settings.maps_dir))
+    refuse_without_landmarks(opened)
     map_id, version = opened.manifest.id, opened.manifest.version
     method = method_for(settings, opened)
     refuse_strange_settings(opened)

@@ -268,7 +268,7 @@ def test_an_anchored_map_is_a_new_version_of_the_same_files(room: Map, maps_dir:
     assert MapStore(maps_dir).current_version("room") == opened.manifest.version
     assert opened.manifest.version != room.manifest.version
     assert opened.manifest.version.endswith(opened.manifest.content_hash[:8])
-    assert opened.manifest.format_version == "3.1"
+    assert opened.manifest.format_version == "3.2"
     assert opened.manifest.files == room.manifest.files
     assert opened.geodetic == found.anchor.geodetic
     assert opened.gravity is not None

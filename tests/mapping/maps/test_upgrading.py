@@ -41,7 +41,7 @@ def test_an_upgraded_map_has_its_own_test_over_the_same_files(old: MapStore) -> 
     folder = upgrade_map(before, old.root)
     after = verify_map(folder)
     assert old.current_version("room") == after.manifest.version != before.manifest.version
-    assert after.manifest.format_version == "3.1"
+    assert after.manifest.format_version == "3.2"
     assert after.manifest.files == before.manifest.files
     assert after.manifest.parts.own_test == own_test(before)
     assert before.manifest.parts.own_test is None

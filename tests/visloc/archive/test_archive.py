@@ -264,7 +264,7 @@ def test_programs_that_know_formats_1_call_this_one_newer(
     monkeypatch.setattr("visloc.archive.checks.FORMAT_MAJOR", 1)
     with pytest.raises(MapCorrupt, match="newer visloc wrote the map; upgrade") as caught:
         open_map(folder)
-    assert (caught.value.code, caught.value.got) == ("map.format_version", "3.1")
+    assert (caught.value.code, caught.value.got) == ("map.format_version", "3.2")
 
 
 @pytest.mark.parametrize(
@@ -345,7 +345,7 @@ def test_a_map_of_ready_made_features_with_colours_and_anchor_reads_back(tmp_pat
     folder = write_content(tmp_path / "incoming", make_ready_made_content())
     MapStore(tmp_path / "maps").publish(folder, "room", "v1")
     opened = MapStore(tmp_path / "maps").open("room")
-    assert opened.manifest.format_version == "3.1"
+    assert opened.manifest.format_version == "3.2"
     assert opened.manifest.world.anchor == ANCHOR
     assert opened.manifest.local_features.fingerprint.name == "kapture:D2-Net"
     assert opened.colors is not None

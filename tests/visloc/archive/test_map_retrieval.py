@@ -47,7 +47,7 @@ def test_the_default_comes_back_as_it_was_written(
 ) -> None:
     opened = verify_map(write(fusion))
     assert opened.fusion == fusion
-    assert opened.manifest.format_version == "3.1"
+    assert opened.manifest.format_version == "3.2"
 
 
 def test_maps_that_do_not_say_are_asked_by_gharm_of_all(

@@ -43,7 +43,7 @@ def test_an_own_test_is_kept_and_every_byte_stays_verified(folder: Path) -> None
     version = add_own_test(folder, OwnTest(**GOOD), version="v2-")
     opened = verify_map(folder)
     assert opened.manifest.parts.own_test == OwnTest(**GOOD)
-    assert opened.manifest.format_version == "3.1"
+    assert opened.manifest.format_version == "3.2"
     assert version == opened.manifest.version == f"v2-{opened.manifest.content_hash[:8]}"
 
 

@@ -46,6 +46,7 @@ def test_centres_are_told_relative_to_the_origin_without_losing_digits(far_place
     opened: Any = SimpleNamespace(
         manifest=SimpleNamespace(world=SimpleNamespace(origin=tuple(origin)), parts=Parts()),
         gravity=None,
+        has_landmarks=True,
         image_poses=np.array([[*quaternion, *world.translation]]),
     )
     assert MapGeometry(opened).centers == pytest.approx(TURNED.center[None], abs=1e-8)
