@@ -59,6 +59,7 @@ class OpenMaps:
         Raises:
             Conflict: the map's features are not installed.
             MapCorrupt: the map cannot be used.
+            NotFound: ``map.version``: it was removed.
         """
         found = self._opened.get(version.ref)
         if found is None:
@@ -89,6 +90,8 @@ class OpenMaps:
         return sum(map(_size_of, self._opened.values()))
 
     def _open(self, version: MapFolder) -> Localizer | TileRanker:
+        if not version.folder.is_dir():  # by another replica, while a request here still used it
+            raise refuse("map.version", "the version was removed", field="map", got=version.ref)
         start = perf_counter()
         with _damage_named(version.ref):
             try:

@@ -25,7 +25,7 @@ from service.workers.open_maps import OpenMaps
 from service.workers.photos import DecodedQuery
 from service.workers.vision import Vision
 from visloc.archive import MapStore
-from visloc.errors import Conflict, InvalidInput, WeightsError
+from visloc.errors import Conflict, InvalidInput, NotFound, WeightsError
 from visloc.features import GlobalDescriptor, make_global_descriptor
 from visloc.options import Inference, LocalizeOptions, Matcher, Solver
 from visloc.priors import NO_PRIORS
@@ -63,6 +63,12 @@ def test_a_map_whose_descriptor_has_no_weights_here_is_a_conflict(
     with pytest.raises(Conflict) as caught:
         OpenMaps(SETTINGS).localizer(MapFolder("room@1", MapStore(built_maps).folder("room")))
     assert caught.value.code == "weights.missing"
+
+
+def test_a_version_that_another_replica_removed_is_no_damaged_map(tmp_path: Path) -> None:
+    with pytest.raises(NotFound, match="the version was removed") as caught:
+        OpenMaps(SETTINGS).open(MapFolder("room@1", tmp_path / "room" / "1"))
+    assert caught.value.code == "map.version"
 
 
 def test_work_that_was_given_up_ends_when_its_photo_is_decoded(
