@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mapping.maps.editing import content_of, joined, moved, selected
-from mapping.own_test.publishing import publish_content, publish_edited
+from mapping.own_test.publishing import publish_edited, publish_tested, write_content
 from mapping.stages.publishing import link_photos, photo_files
 from visloc.archive import Geodetic, Map, MapContent, MapStore
 from visloc.archive.places import enu_of
@@ -50,7 +50,8 @@ def published_again(opened: Map, root: Path) -> Map:
         link_photos(incoming, photo_files(opened))
         if "pairs.txt" in opened.manifest.files:
             shutil.copy(opened.path / "pairs.txt", incoming)
-        publish_content(store, incoming, content_of(opened), "edited")
+        version = write_content(incoming, content_of(opened), "edited")
+        publish_tested(store, incoming, "edited", version)
     return store.open("edited")
 
 
