@@ -58,7 +58,7 @@ class PaperSet:
     """How the paper measures a data set.
 
     Attributes:
-        method: of the map.
+        method: how landmarks are made, as ``mapping build --method``.
         config: of table 2.
         threshold: of ``percent``.
         scenes: the figures by scene, of R2D2 and AP-GeM with the top 20.

@@ -73,7 +73,7 @@ class Assault:
 
     @property
     def attack(self) -> Attack:
-        """What its connections do."""
+        """What the connections of this attack do."""
         return next(each for each in ATTACKS if each.name == self.name)
 
 

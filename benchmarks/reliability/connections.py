@@ -67,7 +67,7 @@ class Besieged:
         doors: to the front.
         cases: what honest clients ask.
         expected: what they are answered.
-        metrics_port: of the service.
+        metrics_port: the service's port for ``/metrics``.
     """
 
     service: ServiceProcess
@@ -92,7 +92,7 @@ async def connections(
     Args:
         maps: to serve.
         work: folder for logs and a certificate.
-        strength: of the attacks.
+        strength: how strong the attacks are.
         limits: of open files; instead of more than this process may have, as many as it may.
         tls: whether the service speaks it.
     """

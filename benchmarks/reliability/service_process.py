@@ -23,7 +23,7 @@ READY_WITHIN_S = 90.0
 
 @dataclass(frozen=True)
 class Addresses:
-    """Where a service is, or a balancer before services.
+    """The addresses of a service, or of a balancer before several.
 
     Attributes:
         url: of its HTTP API.
