@@ -21,7 +21,7 @@ from service.http.app import create_app
 from service.http.backend import Backend
 from service.http.cache_headers import is_current, takes_gzip
 from service.http.slow_clients import Arrivals
-from service.security.access import open_access
+from service.security.access import needed_over_http, open_access
 from service.security.key_file import Scope, edited_keys, new_key
 from service.settings import ServiceSettings
 from service.telemetry.metrics import Metrics, ServiceState
@@ -117,6 +117,13 @@ def test_the_files_are_served_with_what_they_are_and_may_do(
     assert answer.headers["referrer-policy"] == "no-referrer"
     assert answer.headers["permissions-policy"] == "camera=(self)"
     assert answer.headers["cross-origin-opener-policy"] == "same-origin"
+
+
+def test_no_page_needs_a_key() -> None:
+    for path in service.http.static_page.PAGES:
+        assert needed_over_http("GET", path, page=True) is None
+        assert needed_over_http("POST", path, page=True) is not None
+        assert needed_over_http("GET", path) is not None
 
 
 @pytest.mark.parametrize("path", ["/docs", "/redoc"])
