@@ -327,15 +327,15 @@ def test_a_stream_whose_answers_are_not_taken_is_not_read(one: Any, pretend: Any
 
     def counted() -> Iterator[pb2.LocalizeSequenceRequest]:
         nonlocal sent
-        for message in messages(200, bytes(100_000)):
+        for message in messages(400, bytes(100_000)):
             sent += 1
             yield message
 
     call = one.stub.LocalizeSequence(counted())
 
     assert stalled(pretender) < 60
-    assert sent < 100
-    assert [answer.timestamp for answer in call] == list(range(200))
+    assert sent < 300  # gRPC widens a connection's window to as much as 16 MiB, 167 of these
+    assert [answer.timestamp for answer in call] == list(range(400))
 
 
 def test_a_call_that_is_cancelled_ends_the_work_and_frees_its_place(one: Any, pretend: Any) -> None:
