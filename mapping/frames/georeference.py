@@ -24,10 +24,8 @@ from mapping.frames.anchor import (
     coordinate_system,
 )
 from mapping.frames.anchor_error import place_error
-from mapping.stages.publishing import new_version
-from mapping.stages.work_folder import exclusive
+from mapping.stages.publishing import new_version, successor_of
 from visloc.archive import Anchor, Geodetic, Map, MapStore, down_of, write_anchored
-from visloc.archive.version_rules import outdated
 from visloc.errors import VislocError, refuse
 from visloc.geodesy import enu_from_geodetic
 from visloc.geometry import Pose, Similarity
@@ -261,12 +259,7 @@ def publish_anchored(opened: Map, found: Georeference, maps_dir: Path, *, force:
         raise refuse("map.anchored", field="MAP", ref=opened.ref)
     map_id, based_on = opened.manifest.id, opened.manifest.version
     store = MapStore(maps_dir)
-    with (
-        exclusive(maps_dir / ".work" / f"{map_id}.lock"),
-        store.incoming() as incoming,
-    ):
-        if (current := store.current_version(map_id)) != based_on:
-            raise outdated(map_id, based_on, current)
+    with successor_of(opened, store), store.incoming() as incoming:
         version, created = new_version()
         version = write_anchored(opened, incoming, found.anchor, version=version, created=created)
         return store.publish(incoming, map_id, version, based_on=based_on)

@@ -18,9 +18,9 @@ from visloc.archive import (
     pose_row,
 )
 from visloc.archive.checks import read_record
+from visloc.archive.content import PoseRow
 from visloc.archive.npz import read_npz
 from visloc.archive.schema import CamerasFile
-from visloc.archive.writer import PoseRow
 from visloc.errors import refuse
 from visloc.geometry import Camera, Pose, Similarity
 from visloc.retrieval.index import IndexKind

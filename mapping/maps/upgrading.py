@@ -5,10 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from mapping.own_test.trials import own_test
-from mapping.stages.publishing import new_version
-from mapping.stages.work_folder import exclusive
+from mapping.stages.publishing import new_version, successor_of
 from visloc.archive import Map, MapStore, write_tested
-from visloc.archive.version_rules import outdated
 from visloc.errors import refuse
 from visloc.retrieval.index import MAX_EXACT
 
@@ -33,12 +31,7 @@ def upgrade_map(opened: Map, maps_dir: Path) -> Path:
         raise refuse("map.upgraded", field="MAP", ref=opened.ref)
     map_id, based_on = opened.manifest.id, opened.manifest.version
     store = MapStore(maps_dir)
-    with (
-        exclusive(maps_dir / ".work" / f"{map_id}.lock"),
-        store.incoming() as incoming,
-    ):
-        if (current := store.current_version(map_id)) != based_on:
-            raise outdated(map_id, based_on, current)
+    with successor_of(opened, store), store.incoming() as incoming:
         version, created = new_version()
         version = write_tested(
             opened,

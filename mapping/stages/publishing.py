@@ -1,14 +1,17 @@
-"""Names of versions, and the files beside a map's arrays."""
+"""Names and locks of versions, and the files beside a map's arrays."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 
-from visloc.archive import Map
+from mapping.stages.work_folder import exclusive
+from visloc.archive import Map, MapStore
 from visloc.archive.anchoring import link_or_copy
 from visloc.archive.schema import photo_file
+from visloc.archive.version_rules import outdated
 
 PAIRS = "pairs.txt"
 
@@ -31,3 +34,28 @@ def new_version() -> tuple[str, str]:
     """Name a version after the current time: a prefix for its content hash, and ISO 8601 in UTC."""
     now = datetime.now(UTC)
     return now.strftime("%Y%m%dT%H%M%S.%f")[:-3] + "Z-", now.isoformat(timespec="seconds")
+
+
+@contextmanager
+def sole_publisher(maps_dir: Path, map_id: str) -> Iterator[None]:
+    """Hold a map's lock, so that one job at a time makes versions of it.
+
+    Raises:
+        Conflict: ``build.running``.
+    """
+    with exclusive(maps_dir / ".work" / f"{map_id}.lock"):
+        yield
+
+
+@contextmanager
+def successor_of(opened: Map, store: MapStore) -> Iterator[None]:
+    """Hold a map's lock while a version is made that replaces this one, its current one.
+
+    Raises:
+        Conflict: ``map.outdated`` when another version is current; ``build.running``.
+    """
+    map_id, version = opened.manifest.id, opened.manifest.version
+    with sole_publisher(store.root, map_id):
+        if (current := store.current_version(map_id)) != version:
+            raise outdated(map_id, version, current)
+        yield

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from visloc.archive.anchoring import write_anchored
 from visloc.archive.checks import sha256_of
+from visloc.archive.content import GlobalFeatures, Landmarks, MapContent, pose_row
 from visloc.archive.parts import add_own_test, write_tested
 from visloc.archive.places import GeoCircle, circle_of, down_of
 from visloc.archive.reader import Map, MapOutline, open_map, verify_map
@@ -30,7 +31,7 @@ from visloc.archive.sets import (
     write_set,
 )
 from visloc.archive.store import MapStore
-from visloc.archive.writer import GlobalFeatures, Landmarks, MapContent, pose_row, write_map
+from visloc.archive.writer import write_map
 
 __all__ = [
     "Anchor",

@@ -8,10 +8,10 @@ import os
 import shutil
 from pathlib import Path
 
+from visloc.archive.files import Files
 from visloc.archive.places import down_of
 from visloc.archive.reader import Map
 from visloc.archive.schema import Anchor
-from visloc.archive.writer import Files
 
 # Errors of file systems that have no hard links, or none between two folders.
 _NO_LINKS = (errno.EXDEV, errno.EPERM, errno.EMLINK, errno.ENOTSUP)

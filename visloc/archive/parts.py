@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from visloc.archive.anchoring import link_or_copy
+from visloc.archive.files import Files
 from visloc.archive.reader import Map
 from visloc.archive.schema import FORMAT_MAJOR, FORMAT_MINOR, INDEX_FOLDER, Doubt, OwnTest
-from visloc.archive.writer import Files, write_index
+from visloc.archive.writer import write_index
 
 
 def add_own_test(folder: Path, test: OwnTest, *, version: str, doubts: Sequence[Doubt] = ()) -> str:

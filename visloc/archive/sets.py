@@ -19,6 +19,7 @@ from visloc.archive.checks import (
     read_any_manifest,
     read_model,
 )
+from visloc.archive.files import Files
 from visloc.archive.index_files import check_lists, index_files, open_index
 from visloc.archive.reader import MapOutline, Outline, outline_of, verify_map
 from visloc.archive.schema import Extent, FingerprintRecord
@@ -30,7 +31,6 @@ from visloc.archive.set_schema import (
     SetWorld,
     TileRecord,
 )
-from visloc.archive.writer import Files
 from visloc.errors import refuse
 from visloc.retrieval.inverted import InvertedFile, width_of
 

@@ -15,8 +15,7 @@ from mapping.maps.sets import publish_set
 from mapping.methods.retrieval_only import refuse_without_landmarks
 from mapping.own_test.publishing import publish_edited, refuse_not_accepted
 from mapping.report.cameras import origins_record
-from mapping.stages.publishing import photo_files
-from mapping.stages.work_folder import exclusive
+from mapping.stages.publishing import photo_files, sole_publisher
 from visloc.archive import GlobalFeatures, Map, MapContent, MapStore
 from visloc.archive.schema import ID_PATTERN
 from visloc.errors import refuse
@@ -80,7 +79,7 @@ def merge_maps(
     if not accept:
         for opened in (a, b):
             refuse_not_accepted(store, opened)
-    with exclusive(_lock_of(store, map_id)):
+    with sole_publisher(store.root, map_id):
         first, second = content_of(a), content_of(b)
         refuse_other_features(first, second)
         joined(_alike(first), _alike(second))  # refuses early
@@ -110,7 +109,7 @@ def join_as_set(
     """
     _refuse_name(store, set_id)
     a, b = _opened(store, a_ref, b_ref, min_overlap)
-    with exclusive(_lock_of(store, set_id)):
+    with sole_publisher(store.root, set_id):
         refuse_other_features(content_of(a), content_of(b))
         found = register(a, b, min_overlap, progress)
         _refuse_name(store, set_id)  # one may have been made meanwhile
@@ -136,10 +135,6 @@ def _refuse_name(store: MapStore, new_id: str) -> None:
         )
     if new_id in store.ids():
         raise refuse("map.exists", field="--map", got=new_id)
-
-
-def _lock_of(store: MapStore, new_id: str) -> Path:
-    return store.root / ".work" / f"{new_id}.lock"
 
 
 def _opened(store: MapStore, a_ref: str, b_ref: str, min_overlap: float) -> tuple[Map, Map]:

@@ -11,10 +11,8 @@ from mapping.maps.pruning.accuracy import Accuracy, of_held_out_photos
 from mapping.maps.pruning.choosing import LEFT_OUT, Kept, choose, least, num_landmarks, size_with
 from mapping.methods.retrieval_only import refuse_without_landmarks
 from mapping.own_test.publishing import publish_tested, write_content
-from mapping.stages.publishing import link_photos, photo_files
-from mapping.stages.work_folder import exclusive
+from mapping.stages.publishing import link_photos, photo_files, successor_of
 from visloc.archive import Map, MapContent, MapStore, open_map
-from visloc.archive.version_rules import outdated
 from visloc.errors import refuse
 
 Measure = Callable[[Map, Map], tuple[Accuracy, Accuracy]]
@@ -63,9 +61,7 @@ def prune_map(
     before = store.open(map_ref)
     refuse_without_landmarks(before)
     map_id, named = before.manifest.id, before.manifest.version
-    with exclusive(store.root / ".work" / f"{map_id}.lock"):
-        if (current := store.current_version(map_id)) != named:
-            raise outdated(map_id, named, current)
+    with successor_of(before, store):
         progress("choosing", 0, 1)
         kept = keep_within(before, max_bytes, max_landmarks)
         progress("choosing", 1, 1)

@@ -55,11 +55,10 @@ from mapping.stages.landmarks import MadeLandmarks
 from mapping.stages.networks import Networks
 from mapping.stages.photos import MappingPhoto, some
 from mapping.stages.previews import keep_photos
-from mapping.stages.publishing import photo_files
-from mapping.stages.work_folder import WorkFolder, exclusive
+from mapping.stages.publishing import photo_files, successor_of
+from mapping.stages.work_folder import WorkFolder
 from visloc.archive import Map, MapContent, MapStore, open_map
 from visloc.archive.schema import photo_file
-from visloc.archive.version_rules import outdated
 from visloc.errors import refuse
 from visloc.evaluation import pose_error
 from visloc.geometry import Similarity
@@ -142,9 +141,7 @@ def update_map(settings: UpdateSettings, progress: Progress) -> Updated:
     networks = Networks(settings.weights_dir, settings.inference)
     features = open_map_features(settings, opened, work, networks)
     try:
-        with exclusive(work.root.with_name(f"{map_id}.lock")):
-            if (current := store.current_version(map_id)) != version:
-                raise outdated(map_id, version, current)
+        with successor_of(opened, store):
             with Workers(settings.workers) as workers:
                 context = BuildContext(work, features, networks, workers, progress)
                 content, pictures, record, notes = _Job(
