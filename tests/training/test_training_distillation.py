@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -47,26 +47,39 @@ def unit(rng: np.random.Generator, *shape: int) -> torch.Tensor:
     return torch.nn.functional.normalize(values, dim=1)
 
 
-def test_the_loss_of_the_same_step_falls(photos: tuple[Photo, ...]) -> None:
+@dataclass(frozen=True)
+class Trained:
+    """A finished training: its folder, and the loss of one step before and after it."""
+
+    folder: Path
+    before: torch.Tensor
+    after: torch.Tensor
+
+
+@pytest.fixture(scope="module")
+def trained(photos: tuple[Photo, ...], tmp_path_factory: pytest.TempPathFactory) -> Trained:
+    torch.set_num_threads(1)
+    folder = tmp_path_factory.mktemp("trained")
     learning = trainer(photos)
     numbers = learning.task.numbers(3)
     before = learning.task.losses(numbers).detach().sum()
-    for _ in range(SMOKE.steps):
-        learning.advance()
-    after = learning.task.losses(numbers).detach().sum()
-    assert after < 0.9 * before
+    assert train(learning, folder, seconds=None, checkpoint_every_s=1e9)
+    return Trained(folder, before, learning.task.losses(numbers).detach().sum())
+
+
+def test_the_loss_of_the_same_step_falls(trained: Trained) -> None:
+    assert trained.after < 0.9 * trained.before
 
 
 def test_unaltered_photos_stay_close_to_the_teacher_and_weights_ship(
-    photos: tuple[Photo, ...], tmp_path: Path
+    photos: tuple[Photo, ...], trained: Trained
 ) -> None:
-    learning = trainer(photos)
-    assert train(learning, tmp_path, seconds=None, checkpoint_every_s=1e9)
-    path = tmp_path / "xfeat.safetensors"
-    assert export(load_state(tmp_path / FILE_NAME, CPU), path) == path.stat().st_size < 1_500_000
+    folder = trained.folder
+    path = folder / "xfeat.safetensors"
+    assert export(load_state(folder / FILE_NAME, CPU), path) == path.stat().st_size < 1_500_000
     about = read_about(path)
     assert about["licence"] == "Apache-2.0"
-    student, teacher = load_xfeat(tmp_path, Inference.TORCH), load_xfeat(None, Inference.TORCH)
+    student, teacher = load_xfeat(folder, Inference.TORCH), load_xfeat(None, Inference.TORCH)
     assert isinstance(student, XFeatExtractor)
     assert isinstance(teacher, XFeatExtractor)
     assert student.fingerprint.weights_sha256 != teacher.fingerprint.weights_sha256
