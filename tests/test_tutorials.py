@@ -34,7 +34,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What ``make demo`` leaves in ``.demo``, smaller: its dataset, its map and two photos."""
     folder = tmp_path_factory.mktemp("demo")
     dataset = folder / "dataset"
-    write_sample(dataset, images=16, size=(320, 240))
+    write_sample(dataset, images=10, size=(320, 240))
     settings = BuildSettings(dataset / "mapping", "sample", folder / "maps")
     build_map(settings, lambda *_: None)
     for camera, name in (("left", "photo.jpg"), ("right", "right.jpg")):

@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncGenerator, AsyncIterable, AsyncIterator, Callable, Iterable
+from collections.abc import (
+    AsyncGenerator,
+    AsyncIterable,
+    AsyncIterator,
+    Callable,
+    Coroutine,
+    Iterable,
+)
 from typing import Any
 
 import grpc
@@ -45,6 +52,7 @@ async def stream_answers(
     )
     feed = _Feed()
     call = make_call()
+    ending = _Ending(call)
     feeding = asyncio.create_task(feed.write(call, head, waiting))
     try:
         while True:
@@ -54,13 +62,43 @@ async def stream_answers(
             yield _read(server, answer)
     except grpc.aio.AioRpcError as error:
         if feed.failure is None:
-            raise grpc_failure(server, timeout_s, error) from error
+            raise grpc_failure(server, timeout_s, ending.error or error) from error
     finally:
         call.cancel()
         feeding.cancel()
         await asyncio.gather(feeding, return_exceptions=True)
     if feed.failure is not None:
         raise feed.failure
+
+
+class _Ending:
+    """The status with which a call ended.
+
+    When a message is written while the server ends the call, grpc.aio mostly has the server's
+    status first, and then replaces it with ``INTERNAL`` (https://github.com/grpc/grpc/issues/36066).
+
+    Attributes:
+        error: the first status; None while the call lasts.
+    """
+
+    def __init__(self, call: Any) -> None:
+        self.error: grpc.aio.AioRpcError | None = None
+        call.add_done_callback(self._keep)
+
+    def _keep(self, call: Any) -> None:
+        if self.error is None:
+            told = map(_result, (call.code(), call.trailing_metadata(), call.details()))
+            code, trailing, details = told
+            self.error = grpc.aio.AioRpcError(code, grpc.aio.Metadata(), trailing, details, None)
+
+
+def _result(known: Coroutine[Any, Any, Any]) -> Any:
+    """Return the result of a coroutine that waits for nothing."""
+    try:
+        known.send(None)
+    except StopIteration as done:
+        return done.value
+    raise AssertionError("it waits")
 
 
 class _Feed:
