@@ -168,6 +168,10 @@ class ServiceProcess:
         sizes = [resident_bytes(pid) for pid in every]
         return sizes[0], sum(sizes)
 
+    def proportional_bytes(self) -> int:
+        """Resident memory of all its processes; a page that several share counts once."""
+        return sum(map(_proportional_bytes, [self.pid, *_descendants_of(self.pid)]))
+
     def processor_seconds(self) -> float:
         """Processor time that its processes have taken, those that have ended included."""
         return sum(map(_processor_seconds, [self.pid, *_descendants_of(self.pid)]))
@@ -232,6 +236,15 @@ def peak_resident_bytes(pid: int) -> int:
     """Largest resident memory that a living process has had."""
     lines = Path(f"/proc/{pid}/status").read_text().splitlines()
     (line,) = (line for line in lines if line.startswith("VmHWM:"))
+    return int(line.split()[1]) * 1024
+
+
+def _proportional_bytes(pid: int) -> int:
+    try:
+        lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+    except (FileNotFoundError, ProcessLookupError):
+        return 0
+    (line,) = (line for line in lines if line.startswith("Pss:"))
     return int(line.split()[1]) * 1024
 
 

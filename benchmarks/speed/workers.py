@@ -4,16 +4,20 @@
 
 Starts the service once for each shape, asks it by ``localize benchmark``, and prints a table in
 Markdown on stdout. ``default`` is the shape that the service takes by itself. Processor seconds are
-those of all its processes: other programs on the machine hardly change them. ``--only-core`` and
-``--address-space`` make the machine small.
+those of all its processes: other programs on the machine hardly change them. ``--only-core`` leaves
+one core, and ``--memory`` puts the service into a cgroup of its own with so many bytes, which only
+root may do: it is killed where it needs more.
 """
 
 from __future__ import annotations
 
+import atexit
 import json
+import os
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -35,6 +39,7 @@ class Measured:
     Attributes:
         processor_s: of all processes of the service, for one answer.
         peak_bytes: largest resident memory of one worker process so far.
+        together_bytes: of all processes after the run; a page that several share counts once.
     """
 
     shape: str
@@ -44,6 +49,7 @@ class Measured:
     p90_s: float
     processor_s: float
     peak_bytes: int
+    together_bytes: int
 
 
 def main(
@@ -54,15 +60,15 @@ def main(
     concurrencies: Annotated[str, typer.Option(help="requests at a time")] = "1,2,8",
     repeats: Annotated[int, typer.Option(help="runs; the median counts")] = 3,
     only_core: Annotated[int | None, typer.Option(help="the only core of the service")] = None,
-    address_space: Annotated[int | None, typer.Option(help="limit of each process, bytes")] = None,
+    memory: Annotated[int | None, typer.Option(help="limit of all processes, bytes")] = None,
     weights_dir: Annotated[Path | None, typer.Option(help="folder of network weights")] = None,
 ) -> None:
     """Measure and print."""
     before: list[str] = []
     if only_core is not None:
         before += ["taskset", "-c", str(only_core)]
-    if address_space is not None:
-        before += ["prlimit", f"--as={address_space}"]
+    if memory is not None:
+        before += _limited(memory)
     say(f"load average before: {load_average():.1f}")
     measured = []
     for shape in shapes.split(","):
@@ -75,7 +81,7 @@ def main(
                 measured.append(sorted(runs, key=lambda run: run.processor_s)[len(runs) // 2])
                 say(str(measured[-1]))
     head = ["workers x threads", "concurrency", "processor s per photo", "photos per second"]
-    head += ["p50 s", "p90 s", "MiB of a worker at most"]
+    head += ["p50 s", "p90 s", "MiB of a worker at most", "MiB of all together"]
     typer.echo("\n".join(table(head, [_row(each) for each in measured])))
 
 
@@ -88,7 +94,25 @@ def _row(measured: Measured) -> list[str]:
         f"{measured.p50_s:.3f}",
         f"{measured.p90_s:.3f}",
         f"{measured.peak_bytes / 2**20:.0f}",
+        f"{measured.together_bytes / 2**20:.0f}",
     ]
+
+
+def _limited(memory: int) -> list[str]:
+    """Words before a command that put it into a new cgroup, of version 2 or 1."""
+    version_2 = Path("/sys/fs/cgroup/cgroup.controllers").exists()
+    group = Path("/sys/fs/cgroup") / ("" if version_2 else "memory") / f"visloc-{os.getpid()}"
+    group.mkdir()
+    (group / ("memory.max" if version_2 else "memory.limit_in_bytes")).write_text(str(memory))
+    atexit.register(_remove, group)
+    return ["sh", "-c", f'echo $$ > {group}/cgroup.procs; exec "$@"', "sh"]
+
+
+def _remove(group: Path) -> None:
+    """Remove a cgroup once its last process, which multiprocessing leaves for a while, has gone."""
+    while (group / "cgroup.procs").read_text():
+        time.sleep(0.1)
+    group.rmdir()
 
 
 @contextmanager
@@ -122,6 +146,7 @@ def _measure(
         latencies["p90"],
         spent / report["queries"],
         max(map(peak_resident_bytes, service.worker_pids)),
+        service.proportional_bytes(),
     )
 
 
