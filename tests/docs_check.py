@@ -406,7 +406,7 @@ class Desk:
         log = self.folder / "service.log"
         with log.open("wb") as file:
             self.service = subprocess.Popen(
-                [sys.executable, "-m", "service", *taken],
+                [sys.executable, "-m", "service", "--workers=1", *taken],
                 cwd=self.folder,
                 env=environment(),
                 stderr=file,

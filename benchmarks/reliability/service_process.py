@@ -86,6 +86,7 @@ class ServiceProcess:
             "host": host,
             "http_port": self.http_port,
             "grpc_port": self.grpc_port,
+            "workers": 1,
             "threads_per_worker": 1,
             "log_format": "json",
             **settings,

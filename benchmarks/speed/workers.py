@@ -119,7 +119,7 @@ def _remove(group: Path) -> None:
 def _service(
     maps_dir: Path, shape: str, before: Sequence[str], weights_dir: Path | None
 ) -> Iterator[ServiceProcess]:
-    settings: dict[str, Any] = {"threads_per_worker": None}
+    settings: dict[str, Any] = {"workers": None, "threads_per_worker": None}
     if shape != "default":
         workers, threads = shape.split("x")
         settings = {"workers": workers, "threads_per_worker": threads}
