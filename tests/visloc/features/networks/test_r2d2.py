@@ -16,7 +16,6 @@ from torch import Tensor
 
 from visloc.errors import WeightsError
 from visloc.features.networks.r2d2.extractor import (
-    OFFSETS_PX,
     PATCH_PX,
     R2D2Extractor,
     Seen,
@@ -300,35 +299,6 @@ def test_keypoints_of_all_scales_lie_where_the_photo_has_them(tmp_path: Path) ->
         assert np.sqrt((errors[of_level] ** 2).sum(axis=1).mean()) < 0.04 * pixel
         # The reference's mapping x * W / w would be (pixel - 1) / 2 px off: 0.69 at the last.
         assert np.abs(errors[of_level].mean(axis=0)).max() < 0.01 * pixel
-
-
-def test_keypoints_of_weights_with_a_known_offset_are_moved_at_every_scale(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    rows, columns = np.mgrid[:300, :400] + 0.5
-    blobs = [(200, 150), (120, 90), (300, 0.5)]  # the last one is moved out of the picture
-    squared = np.min([(columns - x) ** 2 + (rows - y) ** 2 for x, y in blobs], axis=0)
-    rgb = np.repeat((255 * np.exp(-squared / 50)).astype(np.uint8)[:, :, None], 3, axis=2)
-    _save(tmp_path, "r2d2", _random_state("r2d2"))
-
-    def extract() -> tuple[LocalFeatures, R2D2Extractor]:
-        extractor = load_r2d2(tmp_path)
-        assert isinstance(extractor, R2D2Extractor)
-        extractor.network = _BrightnessNetwork()
-        return extractor.extract(rgb, max_keypoints=1000), extractor
-
-    plain, extractor = extract()
-    sha256 = extractor.fingerprint.weights_sha256
-    monkeypatch.setitem(OFFSETS_PX, sha256, (0.0, 1.0))
-    moved, with_offset = extract()
-
-    scale = 32 / plain.scales
-    expected = plain.keypoints - np.stack([0 * scale, 1 / scale], axis=1)
-    kept = expected[:, 1] >= 0
-    assert 0 < np.count_nonzero(~kept) < len(kept)
-    assert np.allclose(moved.keypoints, expected[kept], atol=1e-3)
-    assert with_offset.fingerprint != extractor.fingerprint
-    assert with_offset.fingerprint.parameters["offset_y_px"] == 1.0
 
 
 def test_log_odds_are_those_of_the_published_repeatability() -> None:

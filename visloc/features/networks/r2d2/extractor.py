@@ -27,14 +27,6 @@ PATCH_PX = 32  # nominal diameter of what one descriptor describes, at scale 1
 # Repeatability is trained to be high in blobs of some pixels, and Fast-R2D2's is interpolated from
 # half the resolution: the pixels next to a peak alone say little about where it is.
 PEAK_REACH_PX = 2
-# How far beside what they are of some weights place keypoints: x, y in pixels of the image that the
-# network sees, by their sha256. Training does not notice, because it compares equal scales; but
-# keypoints of coarse scales lie farther off in the photo than those of fine ones. Measured by
-# ``benchmarks.keypoint_offsets``.
-OFFSETS_PX: Mapping[str, tuple[float, float]] = {
-    # Fast-R2D2 as published
-    "217daa3a166bfe9bf2b68c05c1607a09dd4d552ae1bbeda885479d504eefc14b": (0.0, 1.0),
-}
 _MIN_SHORT_SIDE_PX = 8  # below, a network of 51 px receptive field sees mostly padding
 # Of the scales at which features could be looked for: first, last, step.
 _LEVELS: Mapping[Extraction, tuple[int, int | None, int]] = {
@@ -78,10 +70,6 @@ class R2D2Extractor:
 
     def __init__(self, name: str, weights_sha256: str, network: Network) -> None:
         self.network = network
-        offset = OFFSETS_PX.get(weights_sha256)
-        # A map keeps its fingerprint where nothing is moved.
-        moved = {} if offset is None else {"offset_x_px": offset[0], "offset_y_px": offset[1]}
-        self._offset = np.array(offset or (0.0, 0.0), np.float32)
         self.fingerprint = Fingerprint(
             name=name,
             revision=2,
@@ -92,7 +80,6 @@ class R2D2Extractor:
                 "min_reliability": MIN_RELIABILITY,
                 "min_repeatability": MIN_REPEATABILITY,
                 "peak_reach_px": PEAK_REACH_PX,
-                **moved,
             },
             weights_sha256=weights_sha256,
         )
@@ -120,15 +107,13 @@ class R2D2Extractor:
             for scale, image in pyramid(rgb, extraction):
                 keypoints, descriptors, scores = self._detect(image, max_keypoints)
                 size = np.array([width / image.shape[1], height / image.shape[0]], np.float32)
-                # the pixel centre is half a pixel of the scaled image from its corner
-                keypoints = (keypoints + np.float32(0.5) - self._offset) * size
-                inside = ((keypoints >= 0) & (keypoints <= (width, height))).all(axis=1)
                 found.append(
                     LocalFeatures(
-                        keypoints=keypoints[inside],
-                        descriptors=descriptors[inside],
-                        scores=scores[inside],
-                        scales=np.full(np.count_nonzero(inside), PATCH_PX / scale, np.float32),
+                        # the pixel centre is half a pixel of the scaled image from its corner
+                        keypoints=(keypoints + np.float32(0.5)) * size,
+                        descriptors=descriptors,
+                        scores=scores,
+                        scales=np.full(len(scores), PATCH_PX / scale, np.float32),
                     )
                 )
         return _strongest(found, max_keypoints)
