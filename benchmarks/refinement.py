@@ -74,16 +74,16 @@ def main(
     """Measure and print."""
     rows: list[list[str]] = []
     for map_id, with_rig in _CASES:
-        instants = list(_instants(maps_dir, data_dir / map_id / "query", map_id, weights_dir))
+        instants = list(matched_photos(maps_dir, data_dir / map_id / "query", map_id, weights_dir))
         if with_rig:
-            instants = list(_together(data_dir / map_id / "query", instants))
+            instants = list(of_rig(data_dir / map_id / "query", instants))
         name = f"{map_id}, a rig" if with_rig else map_id
         rows += _compared(name, [instant for _, instant in instants])
     head = ["queries", "refined by", "processor ms", "median cm", "median deg", "moved, std"]
     typer.echo("\n".join(table(head, rows)))
 
 
-def _instants(
+def matched_photos(
     maps_dir: Path, query: Path, map_id: str, weights_dir: Path | None
 ) -> Iterator[tuple[tuple[int, str], Instant]]:
     """Yield the matches of each photo with its time and its camera."""
@@ -103,7 +103,7 @@ def _instants(
         yield (record.timestamp, record.sensor_id), Instant([view], local)
 
 
-def _together(
+def of_rig(
     query: Path, photos: Sequence[tuple[tuple[int, str], Instant]]
 ) -> Iterator[tuple[tuple[int, str], Instant]]:
     """Yield the instants of the dataset's only rig."""

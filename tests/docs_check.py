@@ -202,6 +202,7 @@ RULES = (
         )
     ),
     Rule(Tier.PARSED, r"results|rigs-and|scale\.md|performance", r"", _HOURS),
+    Rule(Tier.PARSED, r"operations|decisions", r"(\w+=\S+ )*python -m benchmarks", _HOURS),
     Rule(Tier.PARSED, r"living-maps|map-sets|mapping\.md", r"python ", _HOURS),
     Rule(Tier.PARSED, r"models/", r"", "hours of training; tests/training"),
 )
