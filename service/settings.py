@@ -8,7 +8,6 @@ thread counts of libraries before they are loaded.
 from __future__ import annotations
 
 import argparse
-import os
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches
@@ -16,6 +15,8 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+
+from service.machine import memory_limit, usable_cores
 
 PREFIX = "VISLOC_"
 CONFIG_VARIABLE = "VISLOC_CONFIG"
@@ -41,6 +42,11 @@ REQUEST_OVERHEAD_BYTES = 64 * 1024
 PIECE_BYTES = 2**20 + 64 * 1024
 # Clients that send or take less than this are disconnected after ``arrival_timeout_s``.
 SLOWEST_BYTES_PER_S = 100_000
+
+
+_MOST_WORKERS = 256
+# With maps of the usual features; those of the map itself are files, which all workers share.
+_BYTES_PER_WORKER = 2**30
 
 
 class SettingsError(ValueError):
@@ -73,12 +79,14 @@ class ServiceSettings(BaseModel):
     """port of the HTTP API; 0 picks a free one"""
     grpc_port: Port = 50051
     """port of the gRPC API; 0 picks a free one"""
-    workers: Annotated[int, Field(ge=1, le=256)] = 1
-    """worker processes; each localizes one photo at a time"""
-    threads_per_worker: Count = Field(
-        default_factory=lambda data: max(1, (os.cpu_count() or 1) // data.get("workers", 1)),
+    workers: Annotated[int, Field(ge=1, le=_MOST_WORKERS)] = Field(
+        default_factory=lambda: default_workers()
     )
-    """processor threads per worker; default: cores / workers"""
+    """worker processes; each localizes one photo at a time; default: one for each core, as far as
+    there is 1 GiB of memory for each"""
+    threads_per_worker: Count = Field(default_factory=lambda: usable_cores())
+    """most processor threads for one photo; photos that are localized at the same time share the
+    cores; default: cores"""
     keys_file: Path | None = None
     """file of API keys that `python -m service.keys` wrote; without keys, the service
     accepts only callers on this machine, and lets them do everything"""
@@ -149,6 +157,13 @@ class ServiceSettings(BaseModel):
     def max_message_bytes(self) -> int:
         """Largest gRPC message: one photo, one instant, or a piece of a packed map."""
         return max(self.max_request_bytes, self.max_batch_bytes, PIECE_BYTES)
+
+
+def default_workers() -> int:
+    """Return how many worker processes keep all cores busy and fit the memory."""
+    memory = memory_limit()
+    fitting = _MOST_WORKERS if memory is None else memory // _BYTES_PER_WORKER
+    return max(1, min(usable_cores(), fitting, _MOST_WORKERS))
 
 
 def read_settings(arguments: Sequence[str], environment: Mapping[str, str]) -> ServiceSettings:

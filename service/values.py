@@ -220,7 +220,7 @@ class WorkerSettings:
     """What a worker process needs to know.
 
     Attributes:
-        threads: processor threads for one photo.
+        threads: most processor threads for one photo.
         max_loaded_bytes: maps that stay open.
         max_images: of one instant.
         max_instants: of one sequence.

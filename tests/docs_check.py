@@ -202,6 +202,7 @@ RULES = (
         )
     ),
     Rule(Tier.PARSED, r"results|rigs-and|scale\.md|performance", r"", _HOURS),
+    Rule(Tier.PARSED, r"operations|decisions", r"(\w+=\S+ )*python -m benchmarks", _HOURS),
     Rule(Tier.PARSED, r"living-maps|map-sets|mapping\.md", r"python ", _HOURS),
     Rule(Tier.PARSED, r"models/", r"", "hours of training; tests/training"),
 )
@@ -406,7 +407,7 @@ class Desk:
         log = self.folder / "service.log"
         with log.open("wb") as file:
             self.service = subprocess.Popen(
-                [sys.executable, "-m", "service", *taken],
+                [sys.executable, "-m", "service", "--workers=1", *taken],
                 cwd=self.folder,
                 env=environment(),
                 stderr=file,

@@ -25,7 +25,15 @@ def serving(maps_dir: Path, log: Path, *arguments: str) -> Iterator[str]:
         log: a file to write.
         arguments: more of the command line.
     """
-    command = [sys.executable, "-m", "service", "--maps-dir", str(maps_dir), *arguments]
+    command = [
+        sys.executable,
+        "-m",
+        "service",
+        "--maps-dir",
+        str(maps_dir),
+        "--workers=1",
+        *arguments,
+    ]
     ports = ["--http-port=0", "--grpc-port=0", "--threads-per-worker=1"]
     with (
         log.open("wb") as stderr,

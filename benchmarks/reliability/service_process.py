@@ -55,7 +55,7 @@ class ServiceProcess:
         before: words before the command, such as ``unshare``'s.
         environment: variables besides this process's own.
         certificate: PEM files of a certificate and its key, for TLS.
-        settings: further settings, by name.
+        settings: further settings, by name; None leaves the service's own default.
 
     Attributes:
         trust: its certificate, where it speaks TLS.
@@ -86,11 +86,16 @@ class ServiceProcess:
             "host": host,
             "http_port": self.http_port,
             "grpc_port": self.grpc_port,
+            "workers": 1,
             "threads_per_worker": 1,
             "log_format": "json",
             **settings,
         }
-        flags = [f"--{name.replace('_', '-')}={value}" for name, value in given.items()]
+        flags = [
+            f"--{name.replace('_', '-')}={value}"
+            for name, value in given.items()
+            if value is not None
+        ]
         # However the benchmark ends, the service is told to end as well.
         ends_with_us = ("setpriv", "--pdeathsig", "TERM")
         self._command = [*before, *ends_with_us, sys.executable, "-m", "service", *flags]
@@ -164,6 +169,14 @@ class ServiceProcess:
         sizes = [resident_bytes(pid) for pid in every]
         return sizes[0], sum(sizes)
 
+    def proportional_bytes(self) -> int:
+        """Resident memory of all its processes; a page that several share counts once."""
+        return sum(map(_proportional_bytes, [self.pid, *_descendants_of(self.pid)]))
+
+    def processor_seconds(self) -> float:
+        """Processor time that its processes have taken, those that have ended included."""
+        return sum(map(_processor_seconds, [self.pid, *_descendants_of(self.pid)]))
+
     def __enter__(self) -> Self:
         self.start()
         try:
@@ -218,6 +231,31 @@ def resident_bytes(pid: int) -> int:
     except (FileNotFoundError, ProcessLookupError):
         return 0
     return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+def peak_resident_bytes(pid: int) -> int:
+    """Largest resident memory that a living process has had."""
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    (line,) = (line for line in lines if line.startswith("VmHWM:"))
+    return int(line.split()[1]) * 1024
+
+
+def _proportional_bytes(pid: int) -> int:
+    try:
+        lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+    except (FileNotFoundError, ProcessLookupError):
+        return 0
+    (line,) = (line for line in lines if line.startswith("Pss:"))
+    return int(line.split()[1]) * 1024
+
+
+def _processor_seconds(pid: int) -> float:
+    """Of a process and of its children that have ended."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except FileNotFoundError:
+        return 0.0
+    return sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
 
 
 def _descendants_of(pid: int) -> Iterator[int]:

@@ -18,7 +18,8 @@ from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.exposition import generate_latest
 
 import visloc
-from service.telemetry.process_memory import memory_limit, resident_memory
+from service.machine import memory_limit
+from service.telemetry.process_memory import resident_memory
 from visloc.errors import VislocError
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"

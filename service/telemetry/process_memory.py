@@ -1,4 +1,4 @@
-"""Memory of processes and of the machine, read from Linux; other systems report nothing.
+"""Memory of processes, read from Linux; other systems report nothing.
 
 Also returns freed memory of this process to the system.
 """
@@ -9,6 +9,8 @@ import asyncio
 import ctypes
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+
+from service.machine import lines_of
 
 _GIVE_BACK_EVERY_S = 5.0
 _M_TRIM_THRESHOLD = -1  # malloc.h
@@ -27,27 +29,11 @@ def resident_memory(
     names = {"server": "self", **{f"worker-{i}": str(pid) for i, pid in enumerate(worker_pids)}}
     found = {}
     for name, folder in names.items():
-        for line in _lines_of(proc / folder / "status"):
+        for line in lines_of(proc / folder / "status"):
             key, _, rest = line.partition(":")
             if key in _KINDS:
                 found[name, _KINDS[key]] = int(rest.split()[0]) * 1024  # always said in kB
     return found
-
-
-def memory_limit(cgroup: Path = Path("/sys/fs/cgroup"), proc: Path = Path("/proc")) -> int | None:
-    """Return the memory for all processes in bytes: the container's, else the machine's."""
-    limits = [
-        int(line)
-        for name in ("memory.max", "memory/memory.limit_in_bytes")  # cgroup v2, v1
-        for line in _lines_of(cgroup / name)
-        if line.isdigit()  # "max": none
-    ]
-    limits += [
-        int(line.split()[1]) * 1024
-        for line in _lines_of(proc / "meminfo")
-        if line.startswith("MemTotal:")
-    ]
-    return min(limits, default=None)
 
 
 async def give_back_memory() -> None:
@@ -64,10 +50,3 @@ async def give_back_memory() -> None:
     while True:
         await asyncio.sleep(_GIVE_BACK_EVERY_S)
         await asyncio.to_thread(libc.malloc_trim, 0)
-
-
-def _lines_of(path: Path) -> list[str]:
-    try:
-        return path.read_text(encoding="ascii", errors="replace").splitlines()
-    except OSError:  # another system, or the process has ended
-        return []

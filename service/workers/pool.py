@@ -24,6 +24,7 @@ from operator import methodcaller
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from service.errors import stopping_error
+from service.machine import usable_cores
 from service.values import MapFolder, OpenMap, WorkerSettings
 from service.workers import process
 from service.workers.tasks import Vision
@@ -76,6 +77,8 @@ class Workers:
         on_death: Callable[[], None],
     ) -> None:
         self._workers = [_Worker(settings) for _ in range(count)]
+        self._most_threads = settings.threads
+        self._cores = usable_cores()
         self._limit_s = limit_s
         self._warm = warm
         self._on_death = on_death
@@ -185,7 +188,7 @@ class Workers:
             queued = await self._next(one)
             if queued is None:  # idle for a while: is it still there?
                 with suppress(VislocError):
-                    await one.run(self._limit_s, _PING)
+                    await one.run(self._limit_s, _PING, self._most_threads)
             elif not queued.answer.done():
                 await self._work_on(one, queued)
             if not one.alive:
@@ -194,7 +197,8 @@ class Workers:
     async def _work_on(self, one: _Worker, queued: _Queued) -> None:
         queued.worker = one
         try:
-            result = await one.run(self._limit_s, queued.task)
+            threads = share_of_cores(self._cores, self.running + 1, self._most_threads)
+            result = await one.run(self._limit_s, queued.task, threads)
         except asyncio.CancelledError:
             if not queued.answer.done():
                 queued.answer.set_exception(stopping_error())
@@ -230,6 +234,14 @@ class Workers:
             else:
                 logger.info("worker process %s took over", one.pid)
                 return
+
+
+def share_of_cores(cores: int, running: int, most: int) -> int:
+    """Return the threads for a task when so many run: a photo alone has all cores.
+
+    Threads beyond the cores would take turns on them, and answer no more photos.
+    """
+    return max(1, min(most, cores // running))
 
 
 class _Worker:
@@ -268,16 +280,19 @@ class _Worker:
         self.pid, self.alive = 0, True
         try:
             # In a thread: the first process waits for the fork server, which loads libraries first.
-            first = await asyncio.to_thread(executor.submit, process.run, _PING)
+            first = await asyncio.to_thread(
+                executor.submit, process.run, _PING, self._settings.threads
+            )
         except (OSError, EOFError) as error:  # no memory or file descriptors for a process
             self.alive = False
             logger.error("no process can be started: %s", error)  # noqa: TRY400
             raise _died() from None
         self.pid = await self._answer_of(first, _START_LIMIT_S)
-        await self._call(_START_LIMIT_S, methodcaller(str(Vision.warm), tuple(maps)))
+        warm = methodcaller(str(Vision.warm), tuple(maps))
+        await self._call(_START_LIMIT_S, warm, self._settings.threads)
 
-    async def run(self, limit_s: float, task: Task[T]) -> T:
-        """Run a task.
+    async def run(self, limit_s: float, task: Task[T], threads: int) -> T:
+        """Run a task with so many threads.
 
         Raises:
             Unavailable: ``server.worker_died``.
@@ -286,7 +301,7 @@ class _Worker:
         self._abandoned.value = False
         self.busy = True
         try:
-            return await self._call(limit_s, task)
+            return await self._call(limit_s, task, threads)
         finally:
             self.busy = False
 
@@ -303,11 +318,11 @@ class _Worker:
             self._executor.shutdown(wait=True, cancel_futures=True)
             self._executor = None
 
-    async def _call(self, limit_s: float, task: Task[T]) -> T:
+    async def _call(self, limit_s: float, task: Task[T], threads: int) -> T:
         if self._executor is None or not self.alive:
             raise _died()
         try:
-            future = self._executor.submit(process.run, task)
+            future = self._executor.submit(process.run, task, threads)
         except BrokenProcessPool:
             self.alive = False
             raise _died() from None

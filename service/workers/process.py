@@ -46,7 +46,8 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def run(task: Callable[[Vision], T]) -> tuple[T, tuple[OpenMap, ...]]:
+def run(task: Callable[[Vision], T], threads: int) -> tuple[T, tuple[OpenMap, ...]]:
     """Return a task's result, and the maps that are open after it."""
     assert _vision is not None  # start ran
+    _vision.use_threads(threads)
     return task(_vision), _vision.open_maps

@@ -67,8 +67,7 @@ class Vision:
     """
 
     def __init__(self, settings: WorkerSettings, abandoned: ctypes.c_bool) -> None:
-        torch.set_num_threads(settings.threads)
-        cv2.setNumThreads(settings.threads)
+        self.use_threads(settings.threads)
         self._settings = settings
         self._limits = ImageLimits(settings.max_image_bytes, settings.max_image_pixels)
         self._abandoned = abandoned
@@ -77,6 +76,15 @@ class Vision:
     @property
     def open_maps(self) -> tuple[OpenMap, ...]:
         return self._maps.refs
+
+    def use_threads(self, count: int) -> None:
+        """Compute with so many threads from now on; answers do not depend on it.
+
+        OpenVINO keeps those that its networks were compiled with. That costs nothing: its threads
+        do not spin while they wait.
+        """
+        torch.set_num_threads(count)
+        cv2.setNumThreads(count)
 
     def ping(self) -> int:
         """Return the id of the process, which shows that it is alive."""

@@ -38,7 +38,7 @@ def doors(built_maps: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterato
         subprocess.Popen(
             [
                 *(sys.executable, "-m", "service", "--maps-dir", str(built_maps)),
-                *("--http-port=0", "--grpc-port=0", "--threads-per-worker=1"),
+                *("--http-port=0", "--grpc-port=0", "--workers=1", "--threads-per-worker=1"),
             ],
             stderr=stderr,
             env={name: value for name, value in os.environ.items() if "VISLOC" not in name},

@@ -56,7 +56,7 @@ def serving(maps_dir: Path, log: Path) -> Iterator[Service]:
         process = subprocess.Popen(
             [
                 *(sys.executable, "-m", "service", "--maps-dir", str(maps_dir)),
-                *("--http-port=0", "--grpc-port=0", "--threads-per-worker=1"),
+                *("--http-port=0", "--grpc-port=0", "--workers=1", "--threads-per-worker=1"),
             ],
             stderr=stderr,
             env=ENVIRONMENT,

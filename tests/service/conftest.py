@@ -49,7 +49,10 @@ def serving(maps_dir: Path, *, load: bool = True, **settings: object) -> Iterato
     async def make() -> Server:
         return Server(
             ServiceSettings(
-                maps_dir=maps_dir, http_port=0, grpc_port=0, threads_per_worker=1, **settings
+                maps_dir=maps_dir,
+                http_port=0,
+                grpc_port=0,
+                **{"workers": 1, "threads_per_worker": 1, **settings},
             )
         )
 

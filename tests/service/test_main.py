@@ -37,7 +37,7 @@ def test_main_sets_thread_counts_before_the_libraries_that_read_them_are_loaded(
 def started(*arguments: str) -> Iterator[subprocess.Popen[str]]:
     environment = {name: value for name, value in os.environ.items() if "VISLOC" not in name}
     process = subprocess.Popen(
-        [sys.executable, "-m", "service", *arguments],
+        [sys.executable, "-m", "service", "--workers=1", *arguments],
         stderr=subprocess.PIPE,
         text=True,
         env=environment,

@@ -26,7 +26,7 @@ def test_a_flag_beats_the_environment_which_beats_the_file_which_beats_the_defau
 
     assert (settings.http_port, settings.grpc_port, settings.max_queue) == (3, 2, 1)
     assert settings.maps_dir == "file"
-    assert settings.workers == 1
+    assert settings.max_batches == 8
 
 
 def test_the_environment_can_name_the_file_and_the_flag_replaces_it(tmp_path: Path) -> None:
@@ -116,12 +116,21 @@ def test_an_empty_variable_counts_as_absent() -> None:
     assert read_settings([], {"VISLOC_WEIGHTS_DIR": "", "VISLOC_CONFIG": ""}).weights_dir is None
 
 
-def test_cores_are_shared_among_the_workers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("os.cpu_count", lambda: 8)
+@pytest.mark.parametrize(
+    ("cores", "gibibytes", "workers"),
+    [(8, 64, 8), (8, 3.9, 3), (8, 0.5, 1), (1, 64, 1), (8, None, 8)],
+)
+def test_there_are_as_many_workers_as_cores_and_memory_allow(
+    cores: int, gibibytes: float | None, workers: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    memory = None if gibibytes is None else int(gibibytes * 2**30)
+    monkeypatch.setattr("service.settings.usable_cores", lambda: cores)
+    monkeypatch.setattr("service.settings.memory_limit", lambda: memory)
 
-    assert read_settings([], {}).threads_per_worker == 8
-    assert read_settings(["--workers", "3"], {}).threads_per_worker == 2
-    assert read_settings(["--workers", "20"], {}).threads_per_worker == 1
+    settings = read_settings([], {})
+
+    assert (settings.workers, settings.threads_per_worker) == (workers, cores)
+    assert read_settings(["--workers", "20"], {}).workers == 20
     assert read_settings(["--threads-per-worker", "4"], {}).threads_per_worker == 4
 
 

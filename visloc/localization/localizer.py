@@ -74,6 +74,7 @@ from visloc.types import (
 if TYPE_CHECKING:
     from visloc.features.networks.lightglue.torch import LightGlue
 
+_PHOTOS_TO_WARM_UP = 2
 # For global descriptors that do not look at the photo.
 _NO_PIXELS = np.empty((0, 0, 3), np.uint8)
 
@@ -145,12 +146,18 @@ class Localizer:
         start_threads()
 
     def warm_up(self) -> None:
-        """Run once on noise, so that the first query does not pay for the first use."""
+        """Run once on noise, so that the first query does not pay for the first use.
+
+        Noise would be refused, then turned, and searched for a focal length. Only the way of a
+        photo that shows the map is run, and with few mapping photos: more are no other code.
+        """
         _ = self.geometry.reach  # computed once; answers carry it
         random = np.random.default_rng(0)
+        camera = Camera("SIMPLE_PINHOLE", 640, 480, (500.0, 320.0, 240.0))
+        options = LocalizeOptions(top_k=_PHOTOS_TO_WARM_UP, read_as=ReadAs.STORED)
         if self._takes_photos(self.map.fusion):
             noise = random.integers(0, 255, (480, 640, 3), dtype=np.uint8)
-            self.localize(Photo(noise), None, LocalizeOptions())
+            self.localize(Photo(noise), camera, options)
             return
         manifest = self.map.manifest
         num_keypoints = min(1000, max_sent_keypoints(manifest))
@@ -160,8 +167,7 @@ class Localizer:
             random.normal(size=(num_keypoints, manifest.local_features.descriptor_dim)),
             {g.fingerprint.name: random.normal(size=g.dim) for g in manifest.global_features},
         )
-        camera = Camera("SIMPLE_PINHOLE", 640, 480, (500.0, 320.0, 240.0))
-        self.localize_features(features, camera, LocalizeOptions())
+        self.localize_features(features, camera, options)
 
     def check(self, options: LocalizeOptions, num_cameras: int = 1) -> None:
         """Refuse options that do not fit the map, before any work.

@@ -216,15 +216,21 @@ def _state(
     half = np.array([0.5, -0.5])
     zoom = np.exp(change[FOCAL] + change[ASPECT] * half)
     from_centre = (errors + view.pixels - centre) * zoom
-    by_change = np.zeros((len(view), 2, len(_ALL)))
-    by_change[:, :, FOCAL] = from_centre
-    by_change[:, 0, SHIFT_X] = by_change[:, 1, SHIFT_Y] = longer_side
-    by_change[:, :, ASPECT] = from_centre * half
+    rows = np.empty((6 + len(free), 2, len(view)))
+    np.multiply(by_pose.T, zoom[:, None], out=rows[:6])
+    for row, name in zip(rows[6:], free, strict=True):
+        if name == FOCAL:
+            row[:] = from_centre.T
+        elif name == ASPECT:
+            row[:] = from_centre.T * half[:, None]
+        else:
+            row[:] = 0.0
+            row[0 if name == SHIFT_X else 1] = longer_side
     return _State(
         rig_from_world,
         change,
         from_centre + centre + longer_side * change[[SHIFT_X, SHIFT_Y]] - view.pixels,
-        np.concatenate([by_pose * zoom[:, None], by_change[:, :, list(free)]], axis=2),
+        rows.T,
     )
 
 
@@ -242,16 +248,16 @@ def _normal_equations(state: _State, max_error_px: float, width: float = 1.0) ->
     inliers = (squared <= (width * max_error_px) ** 2) & has_derivative(
         state.errors, state.jacobian
     )
-    errors, jacobian = state.errors[inliers], state.jacobian[inliers]
-    num_parameters = jacobian.shape[2]
-    if len(errors) < num_parameters:
+    num_parameters = state.jacobian.shape[2]
+    num_inliers = int(np.count_nonzero(inliers))
+    if num_inliers < num_parameters:
         return None
     weight = 1.0 / (1.0 + squared[inliers] / (width * LOSS_SCALE_PX) ** 2)
-    root = np.sqrt(weight)[:, None, None]
+    root = np.sqrt(weight)
     # One row per parameter. einsum, as in ``visloc.pose.refinement``: the bits of a product of
     # matrices depend on the number of threads.
-    columns = np.ascontiguousarray((root * jacobian).reshape(-1, num_parameters).T)
-    weighted = (root[:, :, 0] * errors).ravel()
+    columns = (root * state.jacobian.T[:, :, inliers]).reshape(num_parameters, -1)
+    weighted = (root * state.errors.T[:, inliers]).ravel()
     information = np.einsum("in,jn->ij", columns, columns)
     if not (np.diag(information) > 0).all():
         return None
@@ -261,7 +267,7 @@ def _normal_equations(state: _State, max_error_px: float, width: float = 1.0) ->
         information,
         np.einsum("in,n->i", columns, weighted),
         max(of_one, _MIN_VARIANCE_PX2) * (1.0 + total / _INDEPENDENT_MATCHES),
-        len(errors),
+        num_inliers,
     )
 
 

@@ -151,14 +151,15 @@ def _normal_equations(
     kept = [view.selected(mask) for view, mask in zip(zoomed, pose.inliers, strict=True)]
     errors, jacobian = linearized(kept, pose.rig_from_world, about=np.zeros(3))
     known = has_derivative(errors, jacobian)
-    errors, jacobian = errors[known], jacobian[known]
+    if not known.all():
+        errors, jacobian = errors[known], jacobian[known]
     if len(errors) < MIN_INLIERS:
         return None
-    weight = 1.0 / (1.0 + np.sum(errors * errors, axis=1) / LOSS_SCALE_PX**2)
+    columns = np.ascontiguousarray(errors.T)
+    x, y = columns
+    weight = 1.0 / (1.0 + (x * x + y * y) / LOSS_SCALE_PX**2)
     # One row per parameter, all errors in a row. einsum, not a product of matrices: the sums of
     # the latter depend on the number of threads.
-    weighted = np.ascontiguousarray(
-        (weight[:, None, None] * jacobian).reshape(2 * len(errors), -1).T
-    )
+    weighted = (weight * jacobian.T).reshape(-1, columns.size)
     information = np.einsum("in,jn->ij", weighted, weighted)
-    return information, np.einsum("in,n->i", weighted, errors.ravel())
+    return information, np.einsum("in,n->i", weighted, columns.ravel())

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from service.telemetry.process_memory import give_back_memory, memory_limit, resident_memory
+from service.telemetry.process_memory import give_back_memory, resident_memory
 
 
 def write(path: Path, text: str) -> None:
@@ -24,27 +24,6 @@ def test_the_memory_of_processes_is_read_in_bytes(tmp_path: Path) -> None:
         ("server", "file"): 10 * 1024,
         ("worker-0", "anonymous"): 5 * 1024,
     }
-
-
-def test_the_limit_is_that_of_the_container_when_it_has_one(tmp_path: Path) -> None:
-    cgroup, proc = tmp_path / "cgroup", tmp_path / "proc"
-    assert memory_limit(cgroup, proc) is None  # another system
-
-    write(proc / "meminfo", "MemTotal:       1000 kB\nMemFree:  10 kB\n")
-    assert memory_limit(cgroup, proc) == 1000 * 1024
-
-    write(cgroup / "memory.max", "max\n")
-    assert memory_limit(cgroup, proc) == 1000 * 1024
-
-    write(cgroup / "memory.max", "500000\n")
-    assert memory_limit(cgroup, proc) == 500_000
-
-
-def test_version_1_of_cgroups_says_no_limit_with_a_huge_one(tmp_path: Path) -> None:
-    write(tmp_path / "meminfo", "MemTotal:       1000 kB\n")
-    write(tmp_path / "memory" / "memory.limit_in_bytes", "9223372036854771712\n")
-
-    assert memory_limit(tmp_path, tmp_path) == 1000 * 1024
 
 
 def test_freed_memory_is_given_back_again_and_again(monkeypatch: pytest.MonkeyPatch) -> None:

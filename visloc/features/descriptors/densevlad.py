@@ -141,8 +141,10 @@ def _root_sift(grey: NDArray[np.float32]) -> NDArray[np.float32]:
     # Summed over orientations, a cell is the mean length of its gradients.
     total = words.sum(axis=1, keepdims=True)
     contrasty = total[:, 0] >= MIN_CONTRAST * CELLS_PER_SIDE**2
-    distributions: NDArray[np.float32] = words[contrasty] / total[contrasty]
-    return np.sqrt(distributions)
+    if not contrasty.all():
+        words, total = words[contrasty], total[contrasty]
+    words /= total
+    return np.sqrt(words, out=words)
 
 
 def orientation_channels(grey: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -157,10 +159,11 @@ def orientation_channels(grey: NDArray[np.float32]) -> NDArray[np.float32]:
     lower = floor.astype(np.intp)
     length = length.astype(np.float32, copy=False).ravel()
     above = length * (position - floor)
-    channels = np.zeros((grey.size, ORIENTATIONS), np.float32)
-    pixels = np.arange(grey.size)
-    channels[pixels, lower % ORIENTATIONS] = length - above
-    channels[pixels, (lower + 1) % ORIENTATIONS] = above
+    channels = np.zeros(grey.size * ORIENTATIONS, np.float32)
+    pixels = np.arange(0, channels.size, ORIENTATIONS)
+    # ORIENTATIONS is a power of two: its remainders are bits, which are found much sooner.
+    channels[pixels + (lower & (ORIENTATIONS - 1))] = length - above
+    channels[pixels + ((lower + 1) & (ORIENTATIONS - 1))] = above
     return channels.reshape(*grey.shape, ORIENTATIONS)
 
 
