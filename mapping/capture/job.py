@@ -105,6 +105,7 @@ def capture_map(
     Raises:
         Conflict: ``map.exists`` without ``force``; ``build.running``.
         InvalidInput: ``map.id``, also for one that leaves no room for the ids of pieces.
+        Unavailable: ``storage.failed`` when the disk is full or broken.
         NotFound, InvalidInput: ``capture.*`` for sources and lengths that cannot be used; what
             importers and builds raise.
     """
@@ -115,7 +116,7 @@ def capture_map(
     sources = find_sources(settings.sources)
     # Ids begin with a letter or digit: no work folder of a build has this name.
     root = settings.maps_dir / ".work" / f".capture-{settings.map_id}"
-    with exclusive(root.with_name(f"{root.name}.lock")):
+    with _told_of_the_disk(root), exclusive(root.with_name(f"{root.name}.lock")):
         finished = _published_before(settings, root, store)
         if finished is None:
             refuse_existing_map(settings.map_id, store, force=settings.force)
@@ -144,6 +145,17 @@ def capture_map(
                 partial(doubts_of_capture, films=studied, measured=_measured(yardstick)),
             )
     return Captured(folder, studied, names, notes, root)
+
+
+@contextmanager
+def _told_of_the_disk(root: Path) -> Iterator[None]:
+    """Refuse with the file, and that the same command goes on, when the disk is full or broken."""
+    try:
+        yield
+    except OSError as error:
+        raise refuse(
+            "storage.failed", field=str(error.filename or root), why=error.strerror or error
+        ) from error
 
 
 @contextmanager
