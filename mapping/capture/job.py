@@ -41,7 +41,11 @@ _TOP_K = 12
 _PAST_END_S = 1.0
 # Refusals of photos that do not join, and what would.
 _NOT_JOINED = ("sfm.no_matches", "sfm.no_model", "sfm.no_points")
-_OVERLAP = "photos or a film in which each view overlaps the next, taken while walking, not turning"
+_NO_MAP = "the photos do not show enough of the same to become a map"
+_OVERLAP = (
+    "a film, or a dozen photos or more, in which each view overlaps the next, taken while walking, "
+    "not turning"
+)
 # Says which versions there were when a capture began.
 _BEGUN = "begun.json"
 
@@ -176,7 +180,7 @@ def _told_of_a_capture(notes: Sequence[str]) -> Iterator[None]:
 def _in_words_of_a_capture(error: VislocError) -> VislocError:
     if error.code not in _NOT_JOINED:
         return error
-    return refuse(error.code, error.message, field="SOURCE", expected=_OVERLAP, got=error.got)
+    return refuse(error.code, _NO_MAP, field="SOURCE", expected=_OVERLAP, got=error.got)
 
 
 def _published_before(settings: CaptureSettings, root: Path, store: MapStore) -> Path | None:
