@@ -17,6 +17,8 @@ USED, NOT_CONNECTED, BLURRED = "used", "not connected", "too blurred"
 STILL, SKIPPED = "camera did not move", "skipped: its neighbours show it"
 _STILL = 0.02  # longer sides of the picture in a second
 _GOOD, _USABLE = 0.9, 0.7
+# With fewer of the photos in it, a map is poor; with fewer than the second share, it is not good.
+_LEAST_IN_MAP, _MOST_IN_MAP = 0.5, 0.75
 # Names that a line lists.
 _NAMED = 3
 # Photos in a row that are not found, and show a weak spot of a good map.
@@ -98,8 +100,10 @@ def verdict(trials: Trials, captured: Captured, opened: Map) -> str:
     share = _share_found(trials)
     grade = "good" if share >= _GOOD else ("usable" if share >= _USABLE else "poor")
     doubts = opened.manifest.parts.doubts
-    if doubts or len(opened.images) < len(captured.photos) / 2:
+    if doubts or len(opened.images) < _LEAST_IN_MAP * len(captured.photos):
         grade = "poor"
+    elif grade == "good" and len(opened.images) < _MOST_IN_MAP * len(captured.photos):
+        grade = "usable"
     size = (
         "Its unit is a metre."
         if opened.manifest.world.metric
@@ -122,15 +126,14 @@ def film_again(trials: Trials, stretches: Sequence[Stretch], opened: Map) -> lis
     Of a good map, single photos that are not found tell nothing: most are the ends of a walk.
     """
     advice = {
-        NOT_CONNECTED: "was not connected to the rest: film it again, beginning and ending where "
-        "the map is good",
-        BLURRED: "was too blurred: film it again, slower or with more light",
+        NOT_CONNECTED: "nothing links it to the rest; begin and end where the map is good",
+        BLURRED: "too blurred; walk slower, or with more light",
     }
     lines = [f"{s.source}, {s.what}: {advice[s.fate]}" for s in stretches if s.fate in advice]
     names = [opened.images[image].name for image in trials.images.tolist()]
     least = _LEAST_RUN if _share_found(trials) >= _GOOD else 1
     return lines + [
-        f"{_span(run)}: photos there were not found; film it again from more places, both ways"
+        f"{_span(run)}: photos there were not found; film it from more places, both ways"
         for run in _runs(names, trials.right.tolist())
         if len(run) >= least
     ]

@@ -6,6 +6,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pytest
 
 from mapping.capture.account import fates, film_again, verdict
 from mapping.capture.choosing import ChosenFrames
@@ -80,8 +81,8 @@ def test_what_to_film_again() -> None:
     opened: Any = _Opened([f"{i}.jpg" for i in range(6)])
     trials = Trials(np.arange(6), np.array([True, False, False, True, True, False]))
     lines = film_again(trials, fates(captured(), opened), opened)
-    assert any("second 6 to 8: was too blurred" in line for line in lines)
-    assert any("second 8 to 10: was not connected" in line for line in lines)
+    assert any("second 6 to 8: too blurred" in line for line in lines)
+    assert any("second 8 to 10: nothing links it" in line for line in lines)
     assert any("1.jpg to 2.jpg" in line for line in lines)
     assert any(line.startswith("5.jpg: photos there were not found") for line in lines)
 
@@ -125,14 +126,16 @@ def test_a_map_of_the_sample_is_judged_and_drawn(build_sample: Any, tmp_path: Pa
         assert (picture[:1000] == colour).all(axis=2).sum() > 100
 
 
-def test_a_map_that_lost_most_photos_is_poor() -> None:
-    opened: Any = _Opened(["a.jpg"])
+@pytest.mark.parametrize(
+    ("placed", "grade"), [(1, "poor"), (2, "usable"), (3, "good"), (4, "good")]
+)
+def test_a_map_that_lost_photos_is_not_good(placed: int, grade: str) -> None:
+    names = ["a.jpg", "b.jpg", "c.jpg", "d.jpg"]
+    opened: Any = _Opened(names[:placed])
     opened.manifest = SimpleNamespace(
         world=SimpleNamespace(metric=False), parts=SimpleNamespace(doubts=())
     )
-    trials = Trials(np.array([0]), np.array([True]))
-    text = verdict(
-        trials, Captured(Path("map"), {}, ["a.jpg", "b.jpg", "c.jpg"], (), Path()), opened
-    )
-    assert "The map is poor: 1 of 3 photos" in text
+    trials = Trials(np.arange(placed), np.ones(placed, np.bool_))
+    text = verdict(trials, Captured(Path("map"), {}, names, (), Path()), opened)
+    assert f"The map is {grade}: {placed} of 4 photos" in text
     assert "Its size is not known" in text
