@@ -15,6 +15,10 @@ def not_told(_done: int, _total: int) -> None:
     """Progress that nobody sees."""
 
 
+def nothing_told(_stage: str, _done: int, _total: int) -> None:
+    """Progress of all stages that nobody sees."""
+
+
 def part_of(progress: ItemProgress, number: int, parts: int) -> ItemProgress:
     """Return the progress of one of several equal parts of a stage, counted from 0.
 

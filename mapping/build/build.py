@@ -23,7 +23,7 @@ from mapping.build.pieces import (
 )
 from mapping.build.settings import BuildSettings
 from mapping.cluster.executors import Executor, open_executor
-from mapping.cluster.stage_timings import Costs, wrote
+from mapping.cluster.stage_timings import Costs
 from mapping.cluster.storage import (
     open_store,
     opened_dataset,
@@ -301,15 +301,14 @@ class _Job:
         folder.mkdir(parents=True)
         if settings.keep_photos:
             keep_photos(context, folder, placed)
-        with one_step(context.progress, "archive"):
-            if made.pairs is not None:
-                write_pairs(folder / PAIRS, *made.pairs)
-            if made.imported is not None:
-                made.imported.write(folder)
-            version = write_content(
-                folder, content, map_id, left_out, partial(self._more_doubts, made)
-            )
-            wrote(sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()))
+        if made.pairs is not None:
+            write_pairs(folder / PAIRS, *made.pairs)
+        if made.imported is not None:
+            made.imported.write(folder)
+        more_doubts = partial(self._more_doubts, made)
+        version = write_content(
+            folder, content, map_id, left_out, more_doubts, progress=context.progress
+        )
         return WrittenMap(folder, map_id, version, len(placed))
 
     def _more_doubts(self, made: MadeLandmarks, opened: Map) -> tuple[Doubt, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -16,8 +17,13 @@ USED, NOT_CONNECTED, BLURRED = "used", "not connected", "too blurred"
 STILL, SKIPPED = "camera did not move", "skipped: its neighbours show it"
 _STILL = 0.02  # longer sides of the picture in a second
 _GOOD, _USABLE = 0.9, 0.7
+# With fewer of the photos in it, a map is poor; with fewer than the second share, it is not good.
+_LEAST_IN_MAP, _MOST_IN_MAP = 0.5, 0.75
 # Names that a line lists.
 _NAMED = 3
+# Photos in a row that are not found, and show a weak spot of a good map.
+_LEAST_RUN = 2
+_PHOTO_OF_FILM = re.compile(r"(\d+\.\d+)s\.jpg")
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +60,8 @@ def fates(
             if names:
                 shown = ", ".join(name.partition("/")[2] for name in names[:_NAMED])
                 more = ", ..." if len(names) > _NAMED else ""
-                stretches.append(Stretch(source, f"{len(names)} photos: {shown}{more}", fate))
+                count = f"{len(names)} photo{'s' * (len(names) > 1)}"
+                stretches.append(Stretch(source, f"{count}: {shown}{more}", fate))
     return stretches
 
 
@@ -89,47 +96,70 @@ def _joined(source: str, by_second: Sequence[str]) -> list[Stretch]:
 
 
 def verdict(trials: Trials, captured: Captured, opened: Map) -> str:
-    """How good the map is, in a sentence or two for everybody."""
-    share = float(trials.right.mean()) if len(trials.right) else 0.0
+    """How good the map is, in a few sentences for everybody."""
+    share = _share_found(trials)
     grade = "good" if share >= _GOOD else ("usable" if share >= _USABLE else "poor")
     doubts = opened.manifest.parts.doubts
-    if doubts or len(opened.images) < len(captured.photos) / 2:
+    if doubts or len(opened.images) < _LEAST_IN_MAP * len(captured.photos):
         grade = "poor"
+    elif grade == "good" and len(opened.images) < _MOST_IN_MAP * len(captured.photos):
+        grade = "usable"
     size = (
-        "its unit is a metre"
+        "Its unit is a metre."
         if opened.manifest.world.metric
-        else "its size is not known: give --scale or --marker-size, or photos with GPS"
+        else "Its size is not known: give --scale or --marker-size, or photos with GPS."
     )
-    return (
-        f"the map is {grade}: {len(opened.images)} of {len(captured.photos)} photos are in it, and "
-        f"{int(trials.right.sum())} of {len(trials.right)} photos that were tried came back where "
-        f"they were taken, without themselves and those beside them; {size}"
-        + "".join(f"; {doubt.message}" for doubt in doubts)
-    )
+    lines = [
+        f"The map is {grade}: {len(opened.images)} of {len(captured.photos)} photos are in it.",
+        f"As a test, {len(trials.right)} of them were looked for in the map as if they and those "
+        f"beside them had not been taken: {int(trials.right.sum())} were found where they were "
+        "taken.",
+        size,
+        *(f"What speaks against it: {doubt.message}." for doubt in doubts),
+    ]
+    return " ".join(lines)
 
 
 def film_again(trials: Trials, stretches: Sequence[Stretch], opened: Map) -> list[str]:
-    """What to film again, and how."""
+    """What to film again, and how.
+
+    Of a good map, single photos that are not found tell nothing: most are the ends of a walk.
+    """
     advice = {
-        NOT_CONNECTED: "was not connected to the rest: film it again, beginning and ending where "
-        "the map is good",
-        BLURRED: "was too blurred: film it again, slower or with more light",
+        NOT_CONNECTED: "nothing links it to the rest; begin and end where the map is good",
+        BLURRED: "too blurred; walk slower, or with more light",
     }
     lines = [f"{s.source}, {s.what}: {advice[s.fate]}" for s in stretches if s.fate in advice]
     names = [opened.images[image].name for image in trials.images.tolist()]
+    least = _LEAST_RUN if _share_found(trials) >= _GOOD else 1
     return lines + [
-        f"around {first if first == last else f'{first} to {last}'}: photos there do not "
-        "come back; film it again from more places, both ways"
-        for first, last in _runs(names, trials.right.tolist())
+        f"{_span(run)}: photos there were not found; film it from more places, both ways"
+        for run in _runs(names, trials.right.tolist())
+        if len(run) >= least
     ]
 
 
-def _runs(names: Sequence[str], right: Sequence[bool]) -> Iterable[tuple[str, str]]:
-    """First and last names of runs of photos that did not come back."""
+def _share_found(trials: Trials) -> float:
+    return float(trials.right.mean()) if len(trials.right) else 0.0
+
+
+def _span(names: Sequence[str]) -> str:
+    """Where photos in order begin and end: seconds of a film, else names."""
+    source, _, first = names[0].partition("/")
+    other, _, last = names[-1].partition("/")
+    seconds = [_PHOTO_OF_FILM.fullmatch(name) for name in (first, last)]
+    if source == other and all(seconds):
+        begin, end = (f"{float(found[1]):.1f}" for found in seconds if found)
+        return f"{source}, second {begin}" + (f" to {end}" if end != begin else "")
+    return names[0] + (f" to {names[-1]}" if len(names) > 1 else "")
+
+
+def _runs(names: Sequence[str], right: Sequence[bool]) -> Iterable[Sequence[str]]:
+    """The names of runs of photos that did not come back."""
     start: int | None = None
     for place, holds in enumerate([*right, True]):
         if not holds and start is None:
             start = place
         elif holds and start is not None:
-            yield names[start], names[place - 1]
+            yield names[start:place]
             start = None

@@ -59,13 +59,17 @@ def study_video(
     Raises:
         InvalidInput: as ``frames_of``; ``capture.still`` when fewer than two frames are chosen.
     """
-    facts, sha256 = video_facts(path), sha256_of(path)
+    facts = video_facts(path)
+    whole = max(1, round(facts.seconds))
+    progress(0, whole)  # reading a long video once takes a while, too
+    sha256 = sha256_of(path)
 
     def measured() -> dict[str, NDArray[np.float64]]:
-        motion = measure_motion(_told(path, facts, progress))
+        motion = measure_motion(_told(path, whole, progress))
         return {"seconds": motion.seconds, "sharpness": motion.sharpness, "path": motion.path}
 
     motion = Motion(**work.get(key_of("motion", _REVISION, video=sha256), measured))
+    progress(whole, whole)
     if len(motion.seconds) == 0:
         raise refuse("capture.video", field=str(path), got="no frame that can be decoded")
     chosen = choose_frames(motion, most, wanted_s)
@@ -100,11 +104,8 @@ def _write_photo(path: Path, frame: Frame) -> None:
     unfinished.replace(path)
 
 
-def _told(path: Path, facts: VideoFacts, progress: ItemProgress) -> Iterator[Frame]:
+def _told(path: Path, whole: int, progress: ItemProgress) -> Iterator[Frame]:
     """The frames of a video; progress is in seconds of it."""
-    whole = max(1, round(facts.seconds))
-    progress(0, whole)
     for frame in frames_of(path):
         progress(min(int(frame.seconds), whole - 1), whole)
         yield frame
-    progress(whole, whole)

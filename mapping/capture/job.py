@@ -41,7 +41,11 @@ _TOP_K = 12
 _PAST_END_S = 1.0
 # Refusals of photos that do not join, and what would.
 _NOT_JOINED = ("sfm.no_matches", "sfm.no_model", "sfm.no_points")
-_OVERLAP = "photos or a film in which each view overlaps the next, taken while walking, not turning"
+_NO_MAP = "the photos do not show enough of the same to become a map"
+_OVERLAP = (
+    "a film, or a dozen photos or more, in which each view overlaps the next, taken while walking, "
+    "not turning"
+)
 # Says which versions there were when a capture began.
 _BEGUN = "begun.json"
 
@@ -105,6 +109,7 @@ def capture_map(
     Raises:
         Conflict: ``map.exists`` without ``force``; ``build.running``.
         InvalidInput: ``map.id``, also for one that leaves no room for the ids of pieces.
+        Unavailable: ``storage.failed`` when the disk is full or broken.
         NotFound, InvalidInput: ``capture.*`` for sources and lengths that cannot be used; what
             importers and builds raise.
     """
@@ -115,7 +120,7 @@ def capture_map(
     sources = find_sources(settings.sources)
     # Ids begin with a letter or digit: no work folder of a build has this name.
     root = settings.maps_dir / ".work" / f".capture-{settings.map_id}"
-    with exclusive(root.with_name(f"{root.name}.lock")):
+    with _told_of_the_disk(root), exclusive(root.with_name(f"{root.name}.lock")):
         finished = _published_before(settings, root, store)
         if finished is None:
             refuse_existing_map(settings.map_id, store, force=settings.force)
@@ -147,6 +152,17 @@ def capture_map(
 
 
 @contextmanager
+def _told_of_the_disk(root: Path) -> Iterator[None]:
+    """Refuse with the file, and that the same command goes on, when the disk is full or broken."""
+    try:
+        yield
+    except OSError as error:
+        raise refuse(
+            "storage.failed", field=str(error.filename or root), why=error.strerror or error
+        ) from error
+
+
+@contextmanager
 def _told_of_a_capture(notes: Sequence[str]) -> Iterator[None]:
     """Let a refusal tell what was left out, and what to film instead of options of other commands.
 
@@ -164,7 +180,7 @@ def _told_of_a_capture(notes: Sequence[str]) -> Iterator[None]:
 def _in_words_of_a_capture(error: VislocError) -> VislocError:
     if error.code not in _NOT_JOINED:
         return error
-    return refuse(error.code, error.message, field="SOURCE", expected=_OVERLAP, got=error.got)
+    return refuse(error.code, _NO_MAP, field="SOURCE", expected=_OVERLAP, got=error.got)
 
 
 def _published_before(settings: CaptureSettings, root: Path, store: MapStore) -> Path | None:

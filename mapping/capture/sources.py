@@ -44,6 +44,8 @@ class Sources:
 def find_sources(paths: Sequence[Path]) -> Sources:
     """Tell videos, folders of photos, and exports apart; videos in folders count too.
 
+    What is named twice counts once, such as a video and the folder that it lies in.
+
     Raises:
         NotFound: ``capture.source`` for what is not there.
         InvalidInput: ``capture.video`` for a file that is neither a video nor an export.
@@ -55,11 +57,16 @@ def find_sources(paths: Sequence[Path]) -> Sources:
     for path in paths:
         if not path.exists():
             raise refuse("capture.source", field=str(path))
+        if path.resolve() in {one.resolve() for one in (*videos.values(), *folders.values())}:
+            continue
         if path.is_dir() and (path / _EXPORT).is_file():
             exports[_new_name(path.resolve().name, taken)] = path
         elif path.is_dir():
             folders[_new_name(path.resolve().name, taken)] = path
+            named = {one.resolve() for one in videos.values()}
             for file in sorted(path.iterdir()):
+                if file.resolve() in named:
+                    continue
                 if file.suffix.lower() in SUFFIXES and _is_plain(file) and is_video(file):
                     videos[_new_name(file.stem, taken)] = file
         elif path.suffix.lower() == ".json" and path.is_file():  # a pipe would never end

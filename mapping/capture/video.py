@@ -8,6 +8,7 @@ counted. At most a few decoded frames are in memory at a time.
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -34,6 +35,8 @@ _PIXELS_OPTION = str(_MAX_PIXELS)
 _MIN_SIDE = 64
 # More than an hour at 60 frames a second: of one place, nobody films as long.
 _MAX_FRAMES, _MAX_SECONDS = 250_000, 4 * 3600.0
+# A box of an MP4 has at least its size and kind. Films that are whole have about five.
+_BOX_BYTES, _MOST_BOXES = 8, 1000
 # Damaged packets are passed over up to this number in a row.
 _MAX_DAMAGED = 300
 _ISO6709 = re.compile(r"([+-]\d{2}(?:\.\d+)?)([+-]\d{3}(?:\.\d+)?)([+-]\d+(?:\.\d+)?)?")
@@ -187,6 +190,9 @@ def _opened(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
             # Opening decodes the first frames to learn of the streams.
             container = av.open(file, "r", format=demuxer, options={"max_pixels": _PIXELS_OPTION})
         except (FFmpegError, ValueError, UnicodeError) as error:
+            if demuxer == "mov" and _is_cut(path):
+                cut = "a file that ends too early: copy it again"
+                raise refuse("capture.video", field=str(path), got=cut) from error
             raise _unreadable(path, error) from error
         with container:
             if not container.streams.video:
@@ -198,6 +204,26 @@ def _opened(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
                 yield container, stream
             except FFmpegError as error:
                 raise _unreadable(path, error) from error
+
+
+def _is_cut(path: Path) -> bool:
+    """Tell whether the last box of an MP4 is longer than what is left of the file.
+
+    ISO/IEC 14496-12, section 4.2: a box begins with its size in four bytes, or in eight after its
+    kind; 0 stands for the rest of the file.
+    """
+    left = path.stat().st_size
+    with path.open("rb") as file:
+        for _ in range(_MOST_BOXES):
+            head = file.read(16)
+            size = int.from_bytes(head[8:16] if head[:4] == b"\0\0\0\1" else head[:4])
+            if size > left > 0:
+                return True
+            if size < _BOX_BYTES:
+                return False
+            file.seek(size - len(head), os.SEEK_CUR)
+            left -= size
+    return False
 
 
 def _check_size(path: Path, stream: VideoStream) -> None:

@@ -13,7 +13,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from mapping.frames.anchor import align_poses
-from mapping.methods.colmap_calls import interruptible, quiet
+from mapping.methods.colmap_calls import quiet
 from mapping.methods.colmap_scene import ColmapScene
 from mapping.methods.intrinsics import STEP
 from mapping.methods.sparse_model import SfmPhoto
@@ -27,8 +27,13 @@ _MANY_PHOTOS, _MAX_SHIFT = 30, 0.02
 # Scale of the robust loss. Where errors change by a smaller share in a step, camera centres move by
 # less than a thousandth of what is known of them, however many steps follow.
 _LOSS_SCALE_PX, _LEAST_CHANGE = 1.0, 1e-6
-# Most steps of an adjustment, and those between two reports of progress.
-_MOST_STEPS, _STEPS = 100, 5
+# Most steps of an adjustment of a finished model.
+_MOST_STEPS = 100
+# Most steps between two reports of progress. Of large models fewer: a step takes about a second for
+# a million observations.
+_STEPS, _OBSERVED_IN_STEPS = 5, 2_500_000
+# Models of fewer photos are adjusted more closely while they grow, as in COLMAP.
+_FEW_PHOTOS, _CLOSER = 10, 10.0
 # A step that went as foreseen lets the next one go further by this factor (Ceres).
 _FURTHER = 3.0
 
@@ -127,6 +132,31 @@ def adjusted_robustly(
     return adjusted
 
 
+def adjust_growing(
+    mapper: pycolmap.IncrementalMapper,
+    options: pycolmap.BundleAdjustmentOptions,
+    constant: Collection[int],
+    progress: ItemProgress,
+) -> None:
+    """Adjust all photos of a model that grows, by squared errors.
+
+    What ``mapper.adjust_global_bundle`` does, which reports nothing until it ends.
+
+    Args:
+        mapper: with the model.
+        options: as the pipeline has them.
+        constant: cameras whose intrinsics stay.
+        progress: in steps.
+    """
+    model, solver = mapper.reconstruction, options.ceres.solver_options
+    mapper.observation_manager.filter_observations_with_negative_depth()
+    most = solver.max_num_iterations
+    if model.num_reg_frames() < _FEW_PHOTOS:
+        most *= 2
+        solver.gradient_tolerance /= _CLOSER
+    _adjust(model, options, constant, progress, poses=True, most=most)
+
+
 def adjust_some(model: pycolmap.Reconstruction, image_ids: Collection[int]) -> None:
     """Adjust the poses of some images and the points that they see, robustly; all else stays."""
     config = pycolmap.BundleAdjustmentConfig()
@@ -207,8 +237,9 @@ def _adjust(
     progress: ItemProgress,
     *,
     poses: bool,
+    most: int = _MOST_STEPS,
 ) -> None:
-    """Adjust a model, except the intrinsics of the cameras ``constant``."""
+    """Adjust a model in so many steps; intrinsics of the cameras ``constant`` stay."""
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
         config.add_image(image_id)
@@ -216,7 +247,7 @@ def _adjust(
         config.set_constant_cam_intrinsics(camera_id)
     if poses:
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    _solve(model, options, config, progress)
+    _solve(model, options, config, progress, most)
 
 
 def _solve(
@@ -224,22 +255,25 @@ def _solve(
     options: pycolmap.BundleAdjustmentOptions,
     config: pycolmap.BundleAdjustmentConfig,
     progress: ItemProgress,
+    most: int = _MOST_STEPS,
 ) -> None:
-    """Solve a few steps at a time, as pycolmap reports nothing, and lets no thread run meanwhile.
+    """Solve a few steps at a time.
 
-    Nothing is lost between them but how far a step may go, which is handed on.
+    pycolmap reports nothing, and lets no thread run meanwhile, so that neither progress nor Ctrl-C
+    is seen. Nothing is lost between the steps but how far one may go, which is handed on.
     """
     solver = options.ceres.solver_options
-    solver.max_num_iterations = _STEPS
-    for done in range(0, _MOST_STEPS, _STEPS):
-        progress(done, _MOST_STEPS)
+    steps = max(1, min(_STEPS, _OBSERVED_IN_STEPS // max(1, model.compute_num_observations())))
+    solver.max_num_iterations = steps
+    for done in range(0, most, steps):
+        progress(done, most)
         # pycolmap.bundle_adjustment prints to stderr regardless of options.
         adjuster = pycolmap.create_default_bundle_adjuster(options, config, model)
-        summary = interruptible(lambda token: adjuster.solve())  # noqa: ARG005,B023  not cancelled
+        summary = adjuster.solve()
         if summary.termination_type != pycolmap.BundleAdjustmentTerminationType.NO_CONVERGENCE:
             break
         assert isinstance(summary, pycolmap.CeresBundleAdjustmentSummary)
         if summary.ceres_summary.num_unsuccessful_steps == 0:
-            further = solver.initial_trust_region_radius * _FURTHER**_STEPS
+            further = solver.initial_trust_region_radius * _FURTHER**steps
             solver.initial_trust_region_radius = min(further, solver.max_trust_region_radius)
-    progress(_MOST_STEPS, _MOST_STEPS)
+    progress(most, most)

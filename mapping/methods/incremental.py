@@ -8,13 +8,15 @@ takes most of the time of large models. It also adjusts the finished model twice
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
 import pycolmap
 
+from mapping.methods.adjustment import adjust_growing
 from mapping.methods.colmap_calls import interruptible, quiet
-from mapping.progress import ItemProgress
+from mapping.progress import ItemProgress, part_of
 
 # After so many photos in a row that do not join a small model, another pair begins a model.
 _MIN_TRIALS = 30
@@ -213,20 +215,27 @@ class _Job:
         mapper, options, most = self._mapper, self._options, self._options.ba_global_max_refinements
         mapper.complete_and_merge_tracks(self._triangulation)
         mapper.retriangulate(self._triangulation)
-        for number in range(1, most + 1):
+        for number in range(most):
             observations = mapper.reconstruction.compute_num_observations()
-            mapper.adjust_global_bundle(
-                self._mapper_options, options.get_global_bundle_adjustment()
+            adjust_growing(
+                mapper,
+                options.get_global_bundle_adjustment(),
+                options.constant_cameras,
+                part_of(partial(self._tell_adjusted, at_end=at_end), number, most),
             )
             mapper.reconstruction.normalize()
             changed = mapper.complete_and_merge_tracks(self._triangulation)
             changed += mapper.filter_points(self._mapper_options)
-            self._told.adjust(number / most, at_end=at_end)
             if changed < options.ba_global_max_refinement_change * observations:
                 break
         mapper.clear_modified_points3D()
         mapper.filter_frames(self._mapper_options)
         self._told.adjust(1.0, at_end=at_end)
+
+    def _tell_adjusted(self, done: int, steps: int, *, at_end: bool) -> None:
+        if self._token.is_cancelled:
+            raise InterruptedError  # ends this thread; the caller raises what interrupted it
+        self._told.adjust(done / steps, at_end=at_end)
 
 
 def _size(model: pycolmap.Reconstruction) -> tuple[int, int]:

@@ -39,7 +39,7 @@ from mapping.methods.scenes import find_pairs, make_scene
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.methods.sparse_model import MAPPER_CONFIGS, SparseModel
 from mapping.progress import one_step
-from mapping.stages.camera_mask import CameraMask
+from mapping.stages.camera_mask import CameraMask, where_in_picture
 from mapping.stages.context import BuildContext
 from mapping.stages.landmarks import MadeLandmarks, View, assemble_landmarks
 from mapping.stages.photos import MappingPhoto, some
@@ -284,9 +284,9 @@ def _notes_on_fixed(
     for sensor, mask in fixed.items():
         names = [photo.name for photo in photos if photo.record.sensor_id == sensor]
         notes.append(
-            "something keeps its pixels while the rest moves (part of a vehicle, a logo, dirt on "
-            f"the lens?); about {mask.mean():.0%} of the picture, with its edge, was not used, in "
-            f"{len(names)} photos: {some(names)}"
+            f"something {where_in_picture(mask)} keeps its pixels while the rest moves (part of a "
+            f"vehicle, a logo, dirt on the lens?); about {mask.mean():.0%} of the picture, with "
+            f"its edge, was not used, in {len(names)} photos: {some(names)}"
         )
     return tuple(notes)
 

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
+from mapping.cluster.stage_timings import wrote
 from mapping.own_test.trials import run_own_test
 from mapping.own_test.verdict import doubts_about
+from mapping.progress import Progress, nothing_told, one_step
 from mapping.stages.publishing import link_photos, new_version
 from visloc.archive import Map, MapContent, MapStore, add_own_test, open_map, write_map
 from visloc.archive.checks import read_manifest
@@ -29,6 +32,7 @@ def publish_edited(
     based_on: str | None = None,
     accept: bool = False,
     carried: Sequence[Doubt] = (),
+    progress: Progress = nothing_told,
 ) -> Path:
     """Test content made from maps, and publish it as a version of a map.
 
@@ -39,6 +43,7 @@ def publish_edited(
         based_on: the version that the content was made from, if it is one of the same map.
         accept: make it current all the same.
         carried: doubts about the map that the content was made from.
+        progress: as of ``write_content``.
 
     Returns:
         The folder of the new version.
@@ -50,7 +55,7 @@ def publish_edited(
         raise AssertionError(f"{len(photos)} pictures of {len(content.images)} photos")
     with store.incoming() as incoming:
         link_photos(incoming, photos)
-        version = write_content(incoming, content, map_id, carried=carried)
+        version = write_content(incoming, content, map_id, carried=carried, progress=progress)
         return publish_tested(store, incoming, map_id, version, based_on=based_on, accept=accept)
 
 
@@ -102,6 +107,7 @@ def write_content(
     left_out: Sequence[str] = (),
     examine: Examine | None = None,
     carried: Sequence[Doubt] = (),
+    progress: Progress = nothing_told,
 ) -> str:
     """Write content beside the files that a folder has already, test it, and return its version.
 
@@ -112,11 +118,14 @@ def write_content(
         examine: finds more doubts.
         carried: doubts about the map that the content was made from. Those that only its build
             could find are kept.
+        progress: of the stages "archive" and "own test".
     """
     version, created = new_version()
-    write_map(folder, content, map_id=map_id, version=version, created=created)
+    with one_step(progress, "archive"):
+        write_map(folder, content, map_id=map_id, version=version, created=created)
+        wrote(sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()))
     opened = open_map(folder)
-    run = run_own_test(opened)
+    run = run_own_test(opened, partial(progress, "own test"))
     doubts = (
         *doubts_about(opened, run, left_out),
         *(examine(opened) if examine else ()),

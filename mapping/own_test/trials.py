@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from mapping.cluster.workers import one_thread_here
 from mapping.frames.stored_queries import solve_stored
 from mapping.own_test.error_model import fitted_factor, mahalanobis2
+from mapping.progress import ItemProgress, not_told
 from mapping.report.held_out import match_held_out, spread_photos, taken_with
 from visloc.archive import Map
 from visloc.archive.schema import MAX_FACTOR, MAX_WRONG_SCORES, OwnTest, Score
@@ -73,7 +74,7 @@ def own_test(opened: Map) -> OwnTest:
     return run_own_test(opened).test
 
 
-def run_own_test(opened: Map) -> OwnTestRun:
+def run_own_test(opened: Map, progress: ItemProgress = not_told) -> OwnTestRun:
     """Test a map with what it stores of its own photos.
 
     The photos are spread evenly and every random choice has a seed, so that equal maps have equal
@@ -85,7 +86,8 @@ def run_own_test(opened: Map) -> OwnTestRun:
     images = spread_photos(len(opened.images), most)
     tested, trials, localized, refused = 0, [], [], []
     with one_thread_here():
-        for image in images:
+        for done, image in enumerate(images):
+            progress(done, len(images))
             left_out = left_out_with(opened, viewpoints, image)
             if left_out is None:
                 continue
@@ -96,6 +98,7 @@ def run_own_test(opened: Map) -> OwnTestRun:
             else:
                 trials.append(trial)
                 localized.append(image)
+    progress(len(images), len(images))
     test = learned(trials, tested, geometry.reach, independent=_independent(opened))
     are_wrong = _are_wrong([trial.error for trial in trials], geometry.reach)
     wrong = [image for image, is_wrong in zip(localized, are_wrong, strict=True) if is_wrong]

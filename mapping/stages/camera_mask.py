@@ -11,11 +11,26 @@ CameraMask = NDArray[np.bool_]
 """Cells (rows, columns) of a camera's picture."""
 # Cells along the longer side of a picture.
 _CELLS = 24
+# What spans more of a side than this lies at neither of its ends.
+_ALONG = 0.6
 
 
 def are_masked(camera: Camera, mask: CameraMask, pixels: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Tell which pixels (n, 2) of a camera's photos lie in masked cells."""
     return np.asarray(mask[cells_of(camera, pixels)])
+
+
+def where_in_picture(mask: CameraMask) -> str:
+    """Say in words where the masked cells of a picture lie, as stored."""
+    words = []
+    ends = ("top", "bottom"), ("left", "right")
+    for cells, length, (near, far) in zip(np.nonzero(mask), mask.shape, ends, strict=True):
+        middle = (cells.mean() + 0.5) / length
+        is_along = np.ptp(cells) + 1 > _ALONG * length
+        words.append("" if is_along or 1 / 3 <= middle <= 2 / 3 else near if middle < 0.5 else far)
+    if any(words):
+        return f"at the {' '.join(filter(None, words))}"
+    return "in the middle"
 
 
 def shape_of(camera: Camera) -> tuple[int, int]:

@@ -84,12 +84,12 @@ def merge_maps(
         refuse_other_features(first, second)
         joined(_alike(first), _alike(second))  # refuses early
         found = register(a, b, min_overlap, progress)
-        progress("archive", 0, 1)
         second = moved(second, found.tie.there_from_here, metric=first.metric)
         content, pictures, notes = _joined(a, b, first, second, found)
         _refuse_name(store, map_id)  # one may have been uploaded meanwhile
-        folder = publish_edited(store, content, map_id, photos=pictures, accept=accept)
-        progress("archive", 1, 1)
+        folder = publish_edited(
+            store, content, map_id, photos=pictures, accept=accept, progress=progress
+        )
         return Merged(folder, a, b, found, notes)
 
 

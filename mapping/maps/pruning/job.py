@@ -76,7 +76,7 @@ def prune_map(
                 else [],
             )
             doubts = before.manifest.parts.doubts
-            version = write_content(incoming, content, map_id, carried=doubts)
+            version = write_content(incoming, content, map_id, carried=doubts, progress=progress)
             # Measured before anybody is served it.
             after = open_map(incoming)
             told = partial(progress, "before and after")

@@ -48,7 +48,7 @@ from mapping.methods.rgbd import (
 from mapping.methods.sfm import landmarks_from_matches
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.own_test.publishing import publish_edited
-from mapping.progress import Progress, one_step
+from mapping.progress import Progress
 from mapping.stages.colours import landmark_colours
 from mapping.stages.context import BuildContext
 from mapping.stages.landmarks import MadeLandmarks
@@ -147,16 +147,16 @@ def update_map(settings: UpdateSettings, progress: Progress) -> Updated:
                 content, pictures, record, notes = _Job(
                     settings, opened, dataset, method, context
                 ).run()
-            with one_step(progress, "archive"):
-                folder = publish_edited(
-                    store,
-                    content,
-                    map_id,
-                    photos=pictures,
-                    based_on=version,
-                    accept=settings.accept,
-                    carried=opened.manifest.parts.doubts,
-                )
+            folder = publish_edited(
+                store,
+                content,
+                map_id,
+                photos=pictures,
+                based_on=version,
+                accept=settings.accept,
+                carried=opened.manifest.parts.doubts,
+                progress=progress,
+            )
             shutil.rmtree(work.root, ignore_errors=True)
     except OSError as error:
         raise refuse(

@@ -6,6 +6,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pytest
 
 from mapping.capture.account import fates, film_again, verdict
 from mapping.capture.choosing import ChosenFrames
@@ -57,7 +58,7 @@ def test_every_second_has_a_fate() -> None:
         ("walk", "second 4 to 6", "camera did not move"),
         ("walk", "second 6 to 8", "too blurred"),
         ("walk", "second 8 to 10", "not connected"),
-        ("photos", "1 photos: a.jpg", "used"),
+        ("photos", "1 photo: a.jpg", "used"),
     ]
 
 
@@ -68,7 +69,7 @@ def test_what_another_piece_has_is_not_to_be_filmed_again() -> None:
     assert [(s.source, s.what, s.fate) for s in stretches if "used" in s.fate] == [
         ("walk", "second 0 to 4", "used"),
         ("walk", "second 8 to 10", "used in room-2"),
-        ("photos", "1 photos: a.jpg", "used in room-2"),
+        ("photos", "1 photo: a.jpg", "used in room-2"),
     ]
     trials = Trials(np.arange(4), np.ones(4, np.bool_))
     assert [line[:21] for line in film_again(trials, stretches, opened)] == [
@@ -80,10 +81,29 @@ def test_what_to_film_again() -> None:
     opened: Any = _Opened([f"{i}.jpg" for i in range(6)])
     trials = Trials(np.arange(6), np.array([True, False, False, True, True, False]))
     lines = film_again(trials, fates(captured(), opened), opened)
-    assert any("second 6 to 8: was too blurred" in line for line in lines)
-    assert any("second 8 to 10: was not connected" in line for line in lines)
+    assert any("second 6 to 8: too blurred" in line for line in lines)
+    assert any("second 8 to 10: nothing links it" in line for line in lines)
     assert any("1.jpg to 2.jpg" in line for line in lines)
-    assert any("around 5.jpg:" in line for line in lines)
+    assert any(line.startswith("5.jpg: photos there were not found") for line in lines)
+
+
+def test_weak_spots_of_films_are_told_in_seconds_and_single_photos_of_good_maps_not() -> None:
+    times = [*range(20), 3]
+    names = [f"{'hall' if i == 20 else 'walk'}/{s:05}.400s.jpg" for i, s in enumerate(times)]
+    opened: Any = _Opened(names)
+    right = np.ones(21, np.bool_)
+    right[[7, 20]] = False
+    assert film_again(Trials(np.arange(21), right), [], opened) == []
+    right[[8, 20]] = False, True
+    (line,) = film_again(Trials(np.arange(21), right), [], opened)
+    assert line.startswith("walk, second 7.4 to 8.4: photos there")
+    right[[14, 15, 19, 20]] = False  # not good any more
+    said = [line.partition(":")[0] for line in film_again(Trials(np.arange(21), right), [], opened)]
+    assert said == [
+        "walk, second 7.4 to 8.4",
+        "walk, second 14.4 to 15.4",
+        "walk/00019.400s.jpg to hall/00003.400s.jpg",
+    ]
 
 
 def test_a_map_of_the_sample_is_judged_and_drawn(build_sample: Any, tmp_path: Path) -> None:
@@ -95,8 +115,9 @@ def test_a_map_of_the_sample_is_judged_and_drawn(build_sample: Any, tmp_path: Pa
     names = [image.name for image in opened.images]
     text = verdict(trials, Captured(opened.path, {}, names, (), Path()), opened)
     assert f"{len(names)} of {len(names)} photos are in it" in text
-    assert f"{trials.right.sum()} of {len(names)} photos that were tried came back" in text
-    assert "its unit is a metre" in text
+    assert f"As a test, {len(names)} of them were looked for" in text
+    assert f": {trials.right.sum()} were found where they were taken." in text
+    assert "Its unit is a metre." in text
     target = tmp_path / "walk.png"
     draw_walk(opened, trials, target)
     picture = cv2.imread(str(target))
@@ -105,14 +126,16 @@ def test_a_map_of_the_sample_is_judged_and_drawn(build_sample: Any, tmp_path: Pa
         assert (picture[:1000] == colour).all(axis=2).sum() > 100
 
 
-def test_a_map_that_lost_most_photos_is_poor() -> None:
-    opened: Any = _Opened(["a.jpg"])
+@pytest.mark.parametrize(
+    ("placed", "grade"), [(1, "poor"), (2, "usable"), (3, "good"), (4, "good")]
+)
+def test_a_map_that_lost_photos_is_not_good(placed: int, grade: str) -> None:
+    names = ["a.jpg", "b.jpg", "c.jpg", "d.jpg"]
+    opened: Any = _Opened(names[:placed])
     opened.manifest = SimpleNamespace(
         world=SimpleNamespace(metric=False), parts=SimpleNamespace(doubts=())
     )
-    trials = Trials(np.array([0]), np.array([True]))
-    text = verdict(
-        trials, Captured(Path("map"), {}, ["a.jpg", "b.jpg", "c.jpg"], (), Path()), opened
-    )
-    assert "the map is poor: 1 of 3 photos" in text
-    assert "its size is not known" in text
+    trials = Trials(np.arange(placed), np.ones(placed, np.bool_))
+    text = verdict(trials, Captured(Path("map"), {}, names, (), Path()), opened)
+    assert f"The map is {grade}: {placed} of 4 photos" in text
+    assert "Its size is not known" in text

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +15,8 @@ from mapping.capture.job import capture_map
 from mapping.capture.settings import CaptureSettings
 from tests.mapping.capture.conftest import panned, texture
 from visloc.archive import MapStore
-from visloc.errors import Conflict, InvalidInput
+from visloc.errors import Conflict, InvalidInput, Unavailable
+from visloc.kapture import read_dataset
 
 
 class Killed(Exception):
@@ -59,6 +61,29 @@ def test_a_capture_that_was_killed_after_publishing_is_told_and_not_made_again(
     os.utime(video, ns=(written, written))
     told.forget()
     with pytest.raises(Conflict, match="exists"):
+        capture_map(settings, quiet, quiet)
+
+
+def test_a_full_disk_is_told_and_the_same_command_goes_on(
+    make_video: Callable[..., Path], tmp_path: Path, monkeypatch: Any
+) -> None:
+    """Files may not grow: as on a full disk, a write fails in the middle."""
+    settings = CaptureSettings([make_video(panned(20, 12))], "room", tmp_path / "maps")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4000, hard))
+    try:
+        with pytest.raises(Unavailable) as refused:
+            capture_map(settings, quiet, quiet)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert refused.value.code == "storage.failed"
+    assert str(tmp_path / "maps") in str(refused.value.field)
+
+    def built(build: Any, *_: object) -> Path:
+        raise Killed(len(read_dataset(build.dataset).images))
+
+    monkeypatch.setattr(job, "build_map", built)
+    with pytest.raises(Killed, match="20"):
         capture_map(settings, quiet, quiet)
 
 

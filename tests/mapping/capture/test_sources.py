@@ -52,6 +52,15 @@ def test_videos_and_folders_become_one_dataset(make_video: MakeVideo, tmp_path: 
     assert model.left_out == {}  # the video in the folder is used
 
 
+def test_what_is_named_twice_counts_once(make_video: MakeVideo, tmp_path: Path) -> None:
+    folder = save_photos(tmp_path / "photos")
+    film = shutil.move(make_video(panned(4, step=8)), folder / "walk.mp4")
+    for paths in ([film, folder, film], [folder, film, folder / "." / "walk.mp4", folder]):
+        sources = find_sources(paths)
+        assert sources.videos == {"walk": film}
+        assert sources.folders == {"photos": folder}
+
+
 def test_photos_are_named_by_their_time(make_video: MakeVideo, tmp_path: Path) -> None:
     film = make_video(panned(20, step=8))
     video = study_video(film, WorkFolder(tmp_path / "work"), 100, [], quiet)
@@ -70,7 +79,8 @@ def test_a_killed_capture_keeps_what_was_complete(make_video: MakeVideo, tmp_pat
     untouched = (folder / video.names[0]).stat().st_mtime_ns
     steps: list[tuple[int, int]] = []
     again = study_video(film, work, 100, [], lambda d, t: steps.append((d, t)))
-    assert steps == []  # the pass over the video is kept
+    assert steps == [(0, 2), (2, 2)]  # the pass over the video is kept
+    steps.clear()
     write_photos(again, folder, lambda d, t: steps.append((d, t)))
     assert steps[0] == (len(whole) - 1, len(whole))
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == whole

@@ -154,6 +154,16 @@ def test_a_video_that_is_cut_off(make_video: MakeVideo) -> None:
     assert 0 < len(list(frames_of(cut))) < 40
 
 
+@pytest.mark.parametrize("kept", [0.3, 0.6, 0.9])
+def test_an_mp4_without_its_end_says_that_it_was_cut(make_video: MakeVideo, kept: float) -> None:
+    """Cameras write the index last: without it, nothing can be decoded."""
+    film = make_video(panned(40, step=4))
+    data = film.read_bytes()
+    film.write_bytes(data[: int(kept * len(data))])
+    with pytest.raises(InvalidInput, match="ends too early: copy it again"):
+        list(frames_of(film))
+
+
 def test_damage_within_is_passed_over_or_refused(make_video: MakeVideo) -> None:
     path = make_video(panned(30, step=4))
     data = bytearray(path.read_bytes())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import _thread
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -9,7 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+import pytest
 
+from mapping.methods import adjustment
 from mapping.methods.colmap_scene import colmap_database
 from mapping.methods.incremental import largest_model
 from mapping.methods.matching import Matches
@@ -63,6 +67,51 @@ def test_each_photo_and_each_adjustment_is_told(tmp_path: Path) -> None:
     counts = [done for done, _ in told]
     assert len(set(counts)) >= PHOTOS + 3
     assert max(counts[:-1]) >= 3 * PHOTOS - 1
+
+
+def test_large_models_are_told_more_often_and_come_out_alike(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An adjustment reports after fewer steps where each takes long."""
+    told: dict[str, Told] = {"few": [], "many": []}
+    found = {}
+    with prepared(make_world(PHOTOS, noise_px=0.5), tmp_path) as (path, options):
+        for how, steps in (("many", Told()), ("few", Told())):
+            if how == "few":
+                monkeypatch.setattr(adjustment, "_OBSERVED_IN_STEPS", 1)
+            model = largest_model(path, options, lambda *now: steps.append(now))  # noqa: B023
+            assert model is not None
+            told[how], found[how] = steps, centers(model)
+    assert len(told["few"]) > len(told["many"])
+    assert found["few"].keys() == found["many"].keys()
+    for name, center in found["many"].items():
+        np.testing.assert_allclose(found["few"][name], center, atol=1e-4)
+
+
+def test_ctrl_c_ends_an_adjustment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told: Told = []
+
+    def stop(*now: int) -> None:
+        told.append((now[0], now[1]))
+        if len(told) == 8:  # within the adjustments of the first photos
+            _thread.interrupt_main()
+            # The main thread sees it as soon as pycolmap lets it run.
+            assert interrupted.wait(10)
+
+    interrupted = threading.Event()
+    before = pycolmap.CancellationToken.cancel
+
+    def cancel(token: pycolmap.CancellationToken) -> None:
+        before(token)
+        interrupted.set()
+
+    monkeypatch.setattr(pycolmap.CancellationToken, "cancel", cancel)
+    with (
+        prepared(make_world(PHOTOS, noise_px=0.5), tmp_path) as (path, options),
+        pytest.raises(KeyboardInterrupt),
+    ):
+        largest_model(path, options, stop)
+    assert len(told) <= 9
 
 
 def test_of_two_places_the_larger_is_the_model(tmp_path: Path) -> None:

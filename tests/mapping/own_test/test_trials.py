@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mapping.own_test.trials import Trial, learned, own_test
+from mapping.own_test.trials import Trial, learned, own_test, run_own_test
 from visloc.archive import Map
 from visloc.archive.schema import Score
 from visloc.geometry import Pose
@@ -45,8 +45,11 @@ def test_a_map_without_errors_is_hardly_worse_than_its_photos_tell(square: Map) 
     assert test.independent
 
 
-def test_the_same_map_has_the_same_test(square: Map) -> None:
-    assert own_test(square) == own_test(square)
+def test_the_same_map_has_the_same_test_which_tells_each_photo(square: Map) -> None:
+    told: list[tuple[int, int]] = []
+    run = run_own_test(square, lambda *now: told.append(now))
+    assert run.test == own_test(square)
+    assert told == [(done, 12) for done in range(13)]
 
 
 def test_errors_that_the_residuals_cannot_show_are_found_in_their_size(square: Map) -> None:
