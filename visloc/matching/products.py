@@ -59,8 +59,8 @@ def round_descriptors(descriptors: NDArray[np.float32]) -> EightBitRows:
 class RowProducts(Protocol):
     """Gives the products of some rows of one side with all rows of the other."""
 
-    def __call__(self, rows: slice) -> NDArray[np.int32] | NDArray[np.floating]:
-        """Return whole numbers (k, m), which the next call overwrites."""
+    def __call__(self, rows: slice) -> torch.Tensor:
+        """Return whole numbers (k, m), contiguous, which the next call overwrites."""
 
 
 def row_products(a: NDArray[np.int8], b: NDArray[np.int8], most_rows: int) -> RowProducts:
@@ -78,11 +78,8 @@ def row_products(a: NDArray[np.int8], b: NDArray[np.int8], most_rows: int) -> Ro
     left, right = torch.tensor(a, dtype=operand), torch.tensor(b, dtype=operand).T
     buffer = torch.empty((most_rows, len(b)), dtype=result)
 
-    def products(rows: slice) -> NDArray[np.int32] | NDArray[np.floating]:
-        block = left[rows]
-        out = buffer[: len(block)]
-        multiply(block, right, out=out)
-        return np.asarray(out.numpy())
+    def products(rows: slice) -> torch.Tensor:
+        return multiply(left[rows], right, out=buffer[: rows.stop - rows.start])
 
     return products
 
