@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from visloc.device import has_cuda, torch_device
@@ -110,8 +111,16 @@ def dense_root_sift(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
     Columns: cell row, cell column, orientation of the gradient (0 to the right, then clockwise
     in steps of 45 degrees, as y points down).
     """
-    none = np.zeros((0, CELLS_PER_SIDE**2 * ORIENTATIONS), np.float32)
-    return np.concatenate([none, *map(_root_sift, shrunk_greys(rgb))])
+    cells = [_cells(orientation_channels(grey)) for grey in shrunk_greys(rgb)]
+    words = np.concatenate(
+        [_patches(np.zeros((0, 0, ORIENTATIONS), np.float32)), *map(_patches, cells)]
+    )
+    # Summed over orientations, a cell is the mean length of its gradients.
+    total = words.sum(axis=1)
+    contrasty = total >= MIN_CONTRAST * CELLS_PER_SIDE**2
+    words = words[contrasty]
+    words /= total[contrasty, None]
+    return np.sqrt(words, out=words)
 
 
 def shrunk_greys(rgb: NDArray[np.uint8]) -> list[NDArray[np.float32]]:
@@ -130,19 +139,13 @@ def _shrunk(grey: NDArray[np.float32], scale: float) -> NDArray[np.float32]:
     return shrunk.astype(np.float32, copy=False)
 
 
-def _root_sift(grey: NDArray[np.float32]) -> NDArray[np.float32]:
-    cells = _cells(orientation_channels(grey))
-    rows, columns = (max(0, count - CELLS_PER_SIDE + 1) for count in cells.shape[:2])
-    patches = np.empty((rows, columns, CELLS_PER_SIDE, CELLS_PER_SIDE, ORIENTATIONS), np.float32)
-    for i in range(CELLS_PER_SIDE):
-        for j in range(CELLS_PER_SIDE):
-            patches[:, :, i, j] = cells[i : i + rows, j : j + columns]
-    words = patches.reshape(rows * columns, CELLS_PER_SIDE**2 * ORIENTATIONS)
-    # Summed over orientations, a cell is the mean length of its gradients.
-    total = words.sum(axis=1, keepdims=True)
-    contrasty = total[:, 0] >= MIN_CONTRAST * CELLS_PER_SIDE**2
-    distributions: NDArray[np.float32] = words[contrasty] / total[contrasty]
-    return np.sqrt(distributions)
+def _patches(cells: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the patch that starts at each cell of (h, w, 8): (n, 128), n may be 0."""
+    size = CELLS_PER_SIDE**2 * ORIENTATIONS
+    if min(cells.shape[:2]) < CELLS_PER_SIDE:
+        return np.zeros((0, size), np.float32)
+    windows = sliding_window_view(cells, (CELLS_PER_SIDE, CELLS_PER_SIDE), axis=(0, 1))
+    return windows.transpose(0, 1, 3, 4, 2).reshape(-1, size)
 
 
 def orientation_channels(grey: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -151,16 +154,17 @@ def orientation_channels(grey: NDArray[np.float32]) -> NDArray[np.float32]:
     The length of the gradient, as the difference of the neighbours on either side, is divided
     linearly between the two nearest of the orientations 0, 45, ..., 315 degrees.
     """
-    length, angle = cv2.cartToPolar(*gradient(grey))
-    position = angle.astype(np.float32, copy=False).ravel() * np.float32(ORIENTATIONS / (2 * np.pi))
-    floor = np.floor(position)
-    lower = floor.astype(np.intp)
-    length = length.astype(np.float32, copy=False).ravel()
-    above = length * (position - floor)
-    channels = np.zeros((grey.size, ORIENTATIONS), np.float32)
-    pixels = np.arange(grey.size)
-    channels[pixels, lower % ORIENTATIONS] = length - above
-    channels[pixels, (lower + 1) % ORIENTATIONS] = above
+    length, angle = (
+        part.astype(np.float32, copy=False).ravel() for part in cv2.cartToPolar(*gradient(grey))
+    )
+    position = angle * np.float32(ORIENTATIONS / (2 * np.pi))
+    lower = position.astype(np.int32)  # rounds down: no angle is negative
+    above = length * (position - lower.astype(np.float32))
+    # Rows of numbers that each pixel has in one long row: twice as fast as two indices.
+    first = np.arange(0, grey.size * ORIENTATIONS, ORIENTATIONS)
+    channels = np.zeros(grey.size * ORIENTATIONS, np.float32)
+    channels[first + lower % ORIENTATIONS] = length - above
+    channels[first + (lower + 1) % ORIENTATIONS] = above
     return channels.reshape(*grey.shape, ORIENTATIONS)
 
 
