@@ -12,14 +12,17 @@ from numpy.typing import NDArray
 
 from visloc.device import torch_device
 from visloc.matching.on_device import nearest_on
-from visloc.matching.products import LARGEST_PRODUCT, EightBitRows, in_threads, row_products
+from visloc.matching.products import (
+    LARGEST_PRODUCT,
+    EightBitRows,
+    block_rows,
+    in_threads,
+    row_products,
+)
 
 if TYPE_CHECKING:
     import torch
 
-# A block of products, 4 bytes each, stays in a core's own cache of 1 MB while its largest are
-# looked for. The product of matrices is quickest with a multiple of so many rows.
-_BLOCK_PRODUCTS, _ROWS_STEP = 3 * 2**16, 32
 _MOST_PRODUCTS_ON_DEVICE = 2**26  # 256 MB of them
 # Lowe's test of ambiguity: how much nearer than the second nearest the nearest must be. His 0.8 is
 # for SIFT; learned descriptors of unlike points lie closer together, so 0.9, which was chosen
@@ -126,7 +129,7 @@ def mutual_nearest_neighbours(
     """
     if len(a) == 0 or len(b) == 0:
         return _no_pairs()
-    most_rows = _ROWS_STEP * max(1, round(_BLOCK_PRODUCTS / (len(b) * _ROWS_STEP)))
+    most_rows = block_rows(len(b))
     products = row_products(a.rows, b.rows, most_rows)
     best_b = np.empty(len(a), dtype=np.int64)
     best = np.empty(len(a), dtype=np.float64)

@@ -21,6 +21,9 @@ _LARGEST = 127
 _EXACT_IN_FLOAT32 = 2**24
 LARGEST_PRODUCT = 128**2
 _MOST_COLUMNS = (2**31 - 1) // LARGEST_PRODUCT  # sums fit 32 bits
+# A block of products, 4 bytes each, stays in a core's own cache of 1 MB while its largest are
+# looked for; products of fewer rows take longer each (docs/decisions/0046-blocks-in-cache.md).
+_BLOCK_PRODUCTS, _ROWS_STEP = 3 * 2**16, 32
 
 T = TypeVar("T")
 S = TypeVar("S")
@@ -54,6 +57,11 @@ def round_descriptors(descriptors: NDArray[np.float32]) -> EightBitRows:
     scale = largest / _LARGEST or 1.0
     rows = descriptors / np.float32(scale)
     return EightBitRows(np.rint(rows, out=rows).astype(np.int8), scale)
+
+
+def block_rows(num_columns: int) -> int:
+    """Return how many rows of products with so many columns, at least one, are made at once."""
+    return _ROWS_STEP * max(1, round(_BLOCK_PRODUCTS / (num_columns * _ROWS_STEP)))
 
 
 class RowProducts(Protocol):
