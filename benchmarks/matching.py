@@ -78,10 +78,9 @@ def measure(matched: Matched, repeats: int) -> list[list[float]]:
     """
     query, photos = matched
     for b in photos:
-        for before, now in zip(
-            matched_plainly(query, b), mutual_nearest_neighbours(query, b), strict=True
-        ):
-            assert np.array_equal(before, now)
+        before, now = matched_plainly(query, b), mutual_nearest_neighbours(query, b)
+        for part in range(3):
+            assert np.array_equal(before[part], now[part])
     ways: list[tuple[Callable[[EightBitRows, EightBitRows], Pairs], Callable[[int], int]]] = [
         (matched_plainly, lambda _: ROWS_BEFORE),
         (mutual_nearest_neighbours, block_rows),
@@ -125,8 +124,10 @@ def main(
         partial(make_global_descriptor, weights_dir=weights_dir),
     )
     matched = list(looked_at(localizer, query, photos))
+    threads = torch.get_num_threads()
     torch.set_num_threads(1)
     least = np.median([measure(each, repeats) for each in matched], axis=0) * 1e3
+    torch.set_num_threads(threads)
     keypoints = np.median([len(own) for own, _ in matched])
     landmarks = np.median([sum(map(len, seen)) for _, seen in matched])
     typer.echo(f"{name}: {keypoints:.0f} keypoints, {landmarks:.0f} landmarks of mapping photos")

@@ -122,7 +122,8 @@ def dense_root_sift(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
     contrasty = total >= MIN_CONTRAST * CELLS_PER_SIDE**2
     words = words[contrasty]
     words /= total[contrasty, None]
-    return np.sqrt(words, out=words)
+    np.sqrt(words, out=words)
+    return words
 
 
 def shrunk_greys(rgb: NDArray[np.uint8]) -> list[NDArray[np.float32]]:
