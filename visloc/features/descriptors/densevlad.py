@@ -120,10 +120,9 @@ def dense_root_sift(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
     # Summed over orientations, a cell is the mean length of its gradients.
     total = words.sum(axis=1)
     contrasty = total >= MIN_CONTRAST * CELLS_PER_SIDE**2
-    words = words[contrasty]
-    words /= total[contrasty, None]
-    np.sqrt(words, out=words)
-    return words
+    kept: NDArray[np.float32] = words[contrasty]
+    kept /= total[contrasty, None]
+    return np.sqrt(kept, out=kept)
 
 
 def shrunk_greys(rgb: NDArray[np.uint8]) -> list[NDArray[np.float32]]:
