@@ -21,6 +21,9 @@ _LARGEST = 127
 _EXACT_IN_FLOAT32 = 2**24
 LARGEST_PRODUCT = 128**2
 _MOST_COLUMNS = (2**31 - 1) // LARGEST_PRODUCT  # sums fit 32 bits
+# A block of products, 4 bytes each, stays in a core's own cache of 1 MB while its largest are
+# looked for; products of fewer rows take longer each (docs/decisions/0046-blocks-in-cache.md).
+_BLOCK_PRODUCTS, _ROWS_STEP = 3 * 2**16, 32
 
 T = TypeVar("T")
 S = TypeVar("S")
@@ -56,11 +59,16 @@ def round_descriptors(descriptors: NDArray[np.float32]) -> EightBitRows:
     return EightBitRows(np.rint(rows, out=rows).astype(np.int8), scale)
 
 
+def block_rows(num_columns: int) -> int:
+    """Return how many rows of products with so many columns, at least one, are made at once."""
+    return _ROWS_STEP * max(1, round(_BLOCK_PRODUCTS / (num_columns * _ROWS_STEP)))
+
+
 class RowProducts(Protocol):
     """Gives the products of some rows of one side with all rows of the other."""
 
-    def __call__(self, rows: slice) -> NDArray[np.int32] | NDArray[np.floating]:
-        """Return whole numbers (k, m), which the next call overwrites."""
+    def __call__(self, rows: slice) -> torch.Tensor:
+        """Return whole numbers (k, m), contiguous, which the next call overwrites."""
 
 
 def row_products(a: NDArray[np.int8], b: NDArray[np.int8], most_rows: int) -> RowProducts:
@@ -78,11 +86,8 @@ def row_products(a: NDArray[np.int8], b: NDArray[np.int8], most_rows: int) -> Ro
     left, right = torch.tensor(a, dtype=operand), torch.tensor(b, dtype=operand).T
     buffer = torch.empty((most_rows, len(b)), dtype=result)
 
-    def products(rows: slice) -> NDArray[np.int32] | NDArray[np.floating]:
-        block = left[rows]
-        out = buffer[: len(block)]
-        multiply(block, right, out=out)
-        return np.asarray(out.numpy())
+    def products(rows: slice) -> torch.Tensor:
+        return multiply(left[rows], right, out=buffer[: rows.stop - rows.start])
 
     return products
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from visloc.matching import products
-from visloc.matching.products import in_threads, round_descriptors, row_products
+from visloc.matching.products import block_rows, in_threads, round_descriptors, row_products
 
 
 def test_eight_bits_are_within_half_a_step() -> None:
@@ -57,6 +57,17 @@ def test_the_largest_sums_are_exact(monkeypatch: pytest.MonkeyPatch, dim: int) -
     assert row_products(rows[:2], rows[1:], 2)(slice(0, 2))[:, 0].tolist() == expected
     monkeypatch.setattr(products, "_has_integer_products", lambda: False)
     assert row_products(rows[:2], rows[1:], 2)(slice(0, 2))[:, 0].tolist() == expected
+
+
+@pytest.mark.parametrize("columns", [1, 40, 1500, 2751, 5000])
+def test_a_block_of_products_fits_into_a_megabyte(columns: int) -> None:
+    rows = block_rows(columns)
+    assert rows % 32 == 0
+    assert 0.5 <= rows * columns * 4 / 2**20 <= 1.0
+
+
+def test_a_block_has_rows_however_many_columns() -> None:
+    assert block_rows(10**7) == 32
 
 
 def test_work_in_threads_keeps_its_order_and_leaves_torch_as_it_was() -> None:

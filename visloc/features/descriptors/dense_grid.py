@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-ORIENTATIONS = 8
+ORIENTATIONS = 8  # a power of two
 CELLS_PER_SIDE = 4
 # A cell is this wide in the photo shrunk for its scale; patches overlap by all but one cell.
 CELL_PX = 4

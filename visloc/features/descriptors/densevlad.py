@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from visloc.device import has_cuda, torch_device
@@ -110,8 +111,18 @@ def dense_root_sift(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
     Columns: cell row, cell column, orientation of the gradient (0 to the right, then clockwise
     in steps of 45 degrees, as y points down).
     """
-    none = np.zeros((0, CELLS_PER_SIDE**2 * ORIENTATIONS), np.float32)
-    return np.concatenate([none, *map(_root_sift, shrunk_greys(rgb))])
+    cells = [_cells(orientation_channels(grey)) for grey in shrunk_greys(rgb)]
+    patches = [_patches(each) for each in cells if min(each.shape[:2]) >= CELLS_PER_SIDE]
+    counts = [each.shape[0] * each.shape[1] for each in patches]
+    words = np.empty((sum(counts), CELLS_PER_SIDE**2 * ORIENTATIONS), np.float32)
+    for rows, each in zip(np.split(words, np.cumsum(counts)), patches, strict=False):
+        rows.reshape(each.shape)[...] = each
+    # Summed over orientations, a cell is the mean length of its gradients.
+    total = words.sum(axis=1)
+    contrasty = total >= MIN_CONTRAST * CELLS_PER_SIDE**2
+    kept: NDArray[np.float32] = words[contrasty]
+    kept /= total[contrasty, None]
+    return np.sqrt(kept, out=kept)
 
 
 def shrunk_greys(rgb: NDArray[np.uint8]) -> list[NDArray[np.float32]]:
@@ -130,21 +141,10 @@ def _shrunk(grey: NDArray[np.float32], scale: float) -> NDArray[np.float32]:
     return shrunk.astype(np.float32, copy=False)
 
 
-def _root_sift(grey: NDArray[np.float32]) -> NDArray[np.float32]:
-    cells = _cells(orientation_channels(grey))
-    rows, columns = (max(0, count - CELLS_PER_SIDE + 1) for count in cells.shape[:2])
-    patches = np.empty((rows, columns, CELLS_PER_SIDE, CELLS_PER_SIDE, ORIENTATIONS), np.float32)
-    for i in range(CELLS_PER_SIDE):
-        for j in range(CELLS_PER_SIDE):
-            patches[:, :, i, j] = cells[i : i + rows, j : j + columns]
-    words = patches.reshape(rows * columns, CELLS_PER_SIDE**2 * ORIENTATIONS)
-    # Summed over orientations, a cell is the mean length of its gradients.
-    total = words.sum(axis=1, keepdims=True)
-    contrasty = total[:, 0] >= MIN_CONTRAST * CELLS_PER_SIDE**2
-    if not contrasty.all():
-        words, total = words[contrasty], total[contrasty]
-    words /= total
-    return np.sqrt(words, out=words)
+def _patches(cells: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return views of the patch that starts at each cell of (h, w, 8): (h - 3, w - 3, 4, 4, 8)."""
+    windows = sliding_window_view(cells, (CELLS_PER_SIDE, CELLS_PER_SIDE), axis=(0, 1))
+    return windows.transpose(0, 1, 3, 4, 2)
 
 
 def orientation_channels(grey: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -153,17 +153,17 @@ def orientation_channels(grey: NDArray[np.float32]) -> NDArray[np.float32]:
     The length of the gradient, as the difference of the neighbours on either side, is divided
     linearly between the two nearest of the orientations 0, 45, ..., 315 degrees.
     """
-    length, angle = cv2.cartToPolar(*gradient(grey))
-    position = angle.astype(np.float32, copy=False).ravel() * np.float32(ORIENTATIONS / (2 * np.pi))
-    floor = np.floor(position)
-    lower = floor.astype(np.intp)
-    length = length.astype(np.float32, copy=False).ravel()
-    above = length * (position - floor)
+    length, angle = (
+        part.astype(np.float32, copy=False).ravel() for part in cv2.cartToPolar(*gradient(grey))
+    )
+    position = angle * np.float32(ORIENTATIONS / (2 * np.pi))
+    lower = position.astype(np.int32)  # rounds down: no angle is negative
+    above = length * (position - lower.astype(np.float32))
+    # One index into a long row takes half the time of two, and so does a mask beside a remainder.
+    first = np.arange(0, grey.size * ORIENTATIONS, ORIENTATIONS, dtype=np.int32)
     channels = np.zeros(grey.size * ORIENTATIONS, np.float32)
-    pixels = np.arange(0, channels.size, ORIENTATIONS)
-    # ORIENTATIONS is a power of two: its remainders are bits, which are found much sooner.
-    channels[pixels + (lower & (ORIENTATIONS - 1))] = length - above
-    channels[pixels + ((lower + 1) & (ORIENTATIONS - 1))] = above
+    channels[first + (lower & (ORIENTATIONS - 1))] = length - above
+    channels[first + ((lower + 1) & (ORIENTATIONS - 1))] = above
     return channels.reshape(*grey.shape, ORIENTATIONS)
 
 
