@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pydantic import JsonValue
 
 from mapping.methods.fixed_things import Tally, some_keep_their_pixel
+from mapping.methods.nearest import mutual_rows
 from mapping.methods.two_views import fits_two_views
 from mapping.stages.camera_mask import CameraMask, are_masked
 from mapping.stages.context import BuildContext
@@ -26,7 +27,6 @@ from mapping.stages.work_folder import Item, WorkFolder, key_of
 from visloc.errors import refuse
 from visloc.geometry import Camera, Pose
 from visloc.kapture.matches import MatchFiles, match_file
-from visloc.matching.correspondences import mutual_nearest_neighbours
 from visloc.matching.products import round_descriptors
 from visloc.matching.verification import epipolar_errors
 from visloc.pose.colmap import normalized_rays
@@ -230,13 +230,11 @@ class _MatchTask:
         def compute() -> Item:
             if self.given is not None:
                 return _item(self._given(group, self.given))
-            own = round_descriptors(self.features.read(group.photo).descriptors)
-            found = []
-            for partner in group.partners:
-                theirs = round_descriptors(self.features.read(partner).descriptors)
-                i, j, _ = mutual_nearest_neighbours(own, theirs)
-                found.append(np.column_stack([i, j]).astype(np.uint32))
-            return _item(found)
+            own, *others = (
+                round_descriptors(self.features.read(photo).descriptors).rows
+                for photo in (group.photo, *group.partners)
+            )
+            return _item([mutual_rows(own, theirs) for theirs in others])
 
         if not self.work.has(self.matches_key(group)):
             self.work.get(self.matches_key(group), compute)
