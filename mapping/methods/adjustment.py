@@ -28,7 +28,7 @@ _MANY_PHOTOS, _MAX_SHIFT = 30, 0.02
 # less than a thousandth of what is known of them, however many steps follow.
 _LOSS_SCALE_PX, _LEAST_CHANGE = 1.0, 1e-6
 # Most steps of an adjustment, and those between two reports of progress.
-_MOST_STEPS, _STEPS = 100, 5
+_MOST_STEPS, _STEPS = 100, 10
 # A step that went as foreseen lets the next one go further by this factor (Ceres).
 _FURTHER = 3.0
 
