@@ -3,10 +3,10 @@
     mapping sample /tmp/s200 --images 200
     python -m benchmarks.builds /tmp/s200/mapping .venv/bin/mapping OLD/.venv/bin/mapping
 
-OLD is another checkout with an environment of its own. Each way and number of photos is built by every command
-in turn, from nothing. CPU seconds are of all processes of a build, which tells more than time on a
-machine that does other work. Memory is what all of them hold together, shared pages once, twice a
-second. Prints tables in Markdown.
+OLD is another checkout with an environment of its own. Each way and number of photos is built by
+every command in turn, from nothing. CPU seconds are of all processes of a build, which tells more
+than time on a machine that does other work. Memory is what all of them hold together, shared pages
+once, twice a second. Prints tables in Markdown.
 """
 
 from __future__ import annotations
@@ -132,19 +132,19 @@ def _held(pid: int) -> int:
 
 def _print_table(way: str, count: int, results: list[Built]) -> None:
     names = [f"CPU s, {number}" for number in range(1, len(results) + 1)]
-    print(f"\n`{way}`, {count} photos\n\n| stage | {' | '.join(names)} |")
-    print("|---" * (len(names) + 1) + "|")
+    typer.echo(f"\n`{way}`, {count} photos\n\n| stage | {' | '.join(names)} |")
+    typer.echo("|---" * (len(names) + 1) + "|")
     stages = list(dict.fromkeys(stage for result in results for stage in result.stages))
     for stage in (each for each in stages if each != _ALL):
         costs = [result.stages.get(stage) for result in results]
         cells = ["" if cost is None else f"{cost.cpu_s:.1f}" for cost in costs]
-        print(f"| {stage} | {' | '.join(cells)} |")
+        typer.echo(f"| {stage} | {' | '.join(cells)} |")
     for title, cells in (
         ("**all processes**", [f"**{result.whole.cpu_s:.1f}**" for result in results]),
         ("seconds of the clock", [f"{result.whole.wall_s:.1f}" for result in results]),
         ("most memory, GiB", [f"{result.memory_bytes / 2**30:.2f}" for result in results]),
     ):
-        print(f"| {title} | {' | '.join(cells)} |", flush=True)
+        typer.echo(f"| {title} | {' | '.join(cells)} |")
 
 
 def main(
