@@ -11,6 +11,7 @@ once, twice a second. Prints tables in Markdown.
 
 from __future__ import annotations
 
+import ctypes
 import os
 import re
 import shutil
@@ -18,6 +19,7 @@ import subprocess
 import tempfile
 import threading
 import time
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -35,6 +37,7 @@ _ROW = re.compile(
     r"^\s*(?P<stage>\S.*?)(?:\s+\d+)?\s+(?P<wall>\d+\.\d)\s+(?P<cpu>\d+\.\d)\s+\d+\.\d\s*$"
 )
 _ALL = "in all"
+_PR_SET_CHILD_SUBREAPER = 36  # of Linux
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +75,7 @@ def built(command: Path, dataset: Path, way: str, maps_dir: Path, workers: int) 
     """Build a map, and remove it."""
     call = [str(command.absolute()), "build", str(dataset), "--map", "bench", *WAYS[way]]
     call += ["--maps-dir", str(maps_dir), "--workers", str(workers)]
+    _adopt_orphans()
     start = time.perf_counter()
     with tempfile.TemporaryFile("w+") as out:
         # Not in this folder: its packages would come before those of the command's environment.
@@ -83,13 +87,30 @@ def built(command: Path, dataset: Path, way: str, maps_dir: Path, workers: int) 
         process.returncode = os.waitstatus_to_exitcode(status)
         peak.ended.set()
         peak.join()
+        cpu_s = usage.ru_utime + usage.ru_stime + _spent_by_orphans(peak.seen)
         out.seek(0)
         text = out.read()
     shutil.rmtree(maps_dir, ignore_errors=True)
     stages = _stages(text)
     if _ALL not in stages:  # a map in doubt ends with an error, and has its costs all the same
         raise RuntimeError(f"{' '.join(call)} failed:\n{text}")
-    return Built(Cost(wall_s, usage.ru_utime + usage.ru_stime), stages, peak.largest_bytes)
+    return Built(Cost(wall_s, cpu_s), stages, peak.largest_bytes)
+
+
+def _adopt_orphans() -> None:
+    """Let processes whose parent ends become children of this one: workers outlive their build."""
+    if ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0) != 0:
+        raise OSError("this system does not hand orphans on")
+
+
+def _spent_by_orphans(pids: set[int]) -> float:
+    """Wait for processes that were left, and return their CPU seconds."""
+    spent_s = 0.0
+    for pid in pids:
+        with suppress(ChildProcessError):  # its parent waited for it
+            usage = os.wait4(pid, 0)[2]
+            spent_s += usage.ru_utime + usage.ru_stime
+    return spent_s
 
 
 def _stages(text: str) -> dict[str, Cost]:
@@ -104,12 +125,15 @@ class _Peak(threading.Thread):
     def __init__(self, pid: int) -> None:
         super().__init__(daemon=True)
         self.largest_bytes = 0
+        self.seen: set[int] = set()
         self.ended = threading.Event()
         self._pid = pid
 
     def run(self) -> None:
         while not self.ended.wait(0.5):
-            self.largest_bytes = max(self.largest_bytes, sum(map(_held, _family(self._pid))))
+            family = _family(self._pid)
+            self.seen.update(family)
+            self.largest_bytes = max(self.largest_bytes, sum(map(_held, family)))
 
 
 def _family(pid: int) -> list[int]:

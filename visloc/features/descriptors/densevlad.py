@@ -153,14 +153,13 @@ def orientation_channels(grey: NDArray[np.float32]) -> NDArray[np.float32]:
     """
     length, angle = cv2.cartToPolar(*gradient(grey))
     position = angle.astype(np.float32, copy=False).ravel() * np.float32(ORIENTATIONS / (2 * np.pi))
-    floor = np.floor(position)
-    lower = floor.astype(np.intp)
+    lower = position.astype(np.intp)  # it is not negative
     length = length.astype(np.float32, copy=False).ravel()
-    above = length * (position - floor)
-    channels = np.zeros((grey.size, ORIENTATIONS), np.float32)
-    pixels = np.arange(grey.size)
-    channels[pixels, lower % ORIENTATIONS] = length - above
-    channels[pixels, (lower + 1) % ORIENTATIONS] = above
+    above = length * (position - lower.astype(np.float32))
+    channels = np.zeros(grey.size * ORIENTATIONS, np.float32)
+    first = np.arange(0, channels.size, ORIENTATIONS)  # of each pixel
+    channels[first + lower % ORIENTATIONS] = length - above
+    channels[first + (lower + 1) % ORIENTATIONS] = above
     return channels.reshape(*grey.shape, ORIENTATIONS)
 
 
