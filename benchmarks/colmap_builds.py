@@ -22,12 +22,13 @@ import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
 import pycolmap
 import typer
 
-from benchmarks.builds import built
+from benchmarks.builds import built, first_photos
 from visloc.kapture import Dataset, read_dataset
 
 
 def colmap_model(dataset: Path, way: str, threads: int, told: Connection) -> None:
     """Make a model with pycolmap; send CPU seconds by stage, and what the model holds."""
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.WARNING.value
     read, photos = read_dataset(dataset), dataset / "sensors" / "records_data"
     seconds, start = {}, time.process_time()
     with tempfile.TemporaryDirectory() as folder:
@@ -100,9 +101,17 @@ def main(
     way: Annotated[
         str, typer.Option(help="sfm: with the dataset's poses; poses: without.")
     ] = "sfm",
+    photos: Annotated[int | None, typer.Option(help="First so many; all.")] = None,
     workers: int = 2,
 ) -> None:
     """Build by both, print."""
+    with tempfile.TemporaryDirectory() as folder:
+        if photos is not None:
+            dataset = first_photos(dataset, photos, Path(folder) / "dataset")
+        _compare(dataset, command, way, Path(folder) / "maps", workers)
+
+
+def _compare(dataset: Path, command: Path, way: str, maps_dir: Path, workers: int) -> None:
     own, other = multiprocessing.get_context("spawn").Pipe(duplex=False)
     start = time.perf_counter()
     process = multiprocessing.get_context("spawn").Process(
@@ -113,8 +122,7 @@ def main(
     seconds, (placed, points) = own.recv()
     process.join()
     colmap_s = time.perf_counter() - start
-    with tempfile.TemporaryDirectory() as folder:
-        ours = built(command, dataset, way, Path(folder) / "maps", workers)
+    ours = built(command, dataset, way, maps_dir, workers)
     typer.echo("| | CPU s, COLMAP | CPU s, ours |\n|---|---|---|")
     for stage, spent in seconds.items():
         typer.echo(f"| {stage} | {spent:.1f} | |")
