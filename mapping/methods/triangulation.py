@@ -37,8 +37,8 @@ ADJUSTMENT, TRIANGULATION = "adjustment", "triangulation"
 # Least angle between the rays of the two photos that the mapper begins with, in the median. With
 # COLMAP's 16 degrees they may be far apart and share few matches; what they make places others.
 _FIRST_ANGLE_DEG = 4.0
-# All photos are adjusted together when the model has grown by this factor. With COLMAP's 1.1 twice as
-# many times, which moves no camera by a tenth of a millimetre in the end.
+# All photos are adjusted together when the model has grown by this factor. With COLMAP's 1.1, twice
+# as many times: poses of the painted room and of castle were as good.
 _GROWTH = 1.25
 # After so many models that put cameras in doubt, no camera with a prior is refined any more.
 _MAX_JUDGEMENTS = 3

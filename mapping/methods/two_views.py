@@ -123,8 +123,9 @@ class _TwoViews:
         near = _sampson_errors(self.fundamental, a, b) <= max_error_px
         if self.pose is None:
             return np.asarray(near)
-        rays = (np.column_stack([x / self.focal_px, np.ones(len(x))]) for x in (a, b))
-        errors = epipolar_errors(*rays, Pose(self.pose.R, self.pose.t))
+        ones = np.ones((len(a), 1))
+        rays_a, rays_b = (np.hstack([pixels / self.focal_px, ones]) for pixels in (a, b))
+        errors = epipolar_errors(rays_a, rays_b, Pose(self.pose.R, self.pose.t))
         return np.asarray(near & np.isfinite(errors))
 
 
