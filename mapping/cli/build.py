@@ -190,6 +190,6 @@ def _build(settings: BuildSettings) -> None:
     print_map(open_map(folder))
     print_pieces(store, open_map(folder))
     print_costs(OUT, costs.table())
-    say_peak_memory()
+    say_peak_memory(costs.table()[-1].spent)
     pictures = scratch_folder(settings.maps_dir, settings.cache_dir, ".doubts")
     require_acceptance(open_map(folder), accept=settings.accept, pictures=pictures)

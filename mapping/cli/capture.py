@@ -63,7 +63,7 @@ def capture(
     print_map(opened)
     print_pieces(store, opened)
     print_costs(OUT, costs.table())
-    say_peak_memory()
+    say_peak_memory(costs.table()[-1].spent)
     say_notes(captured.notes)
     _print_account(captured, opened, trials, pieces)
     say(f"picture: {picture}")

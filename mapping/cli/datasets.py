@@ -11,6 +11,7 @@ from mapping.build.pairs import PairsJob, write_pairs_of_dataset
 from mapping.cli.build import CovisibleInOption
 from mapping.cli.display import ERR, print_rig, say, say_notes, say_peak_memory
 from mapping.cli.progress import StageProgress
+from mapping.cluster.stage_timings import spent_here
 from mapping.cluster.storage import map_folder
 from mapping.datasets import READERS, write_parts
 from mapping.frames.rig_calibration import calibrate_rig, refuse_known_rigs, write_calibration
@@ -47,7 +48,7 @@ def pairs(
         count, notes = write_pairs_of_dataset(job, known, progress)
     say(f"{count} pairs: {job.output}")
     say_notes(notes)
-    say_peak_memory()
+    say_peak_memory(spent_here())
 
 
 def calibrate_rig_command(

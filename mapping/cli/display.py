@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import resource
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
@@ -15,7 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from mapping.build.pieces import pieces_of
-from mapping.cluster.stage_timings import StageCost
+from mapping.cluster.stage_timings import Spent, StageCost
 from mapping.frames.georeference import Georeference
 from mapping.frames.rig_calibration import OUTLIER_MULTIPLE, RigCalibration, Spread
 from mapping.importers import ImportSummary
@@ -243,11 +242,9 @@ def print_costs(out: Console, costs: Sequence[StageCost]) -> None:
     out.print(table)
 
 
-def say_peak_memory() -> None:
-    """Print the peak memory of this process or its largest worker."""
-    kinds = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
-    peak_bytes = max(resource.getrusage(kind).ru_maxrss for kind in kinds) * 1024
-    say(f"peak memory {peak_bytes / 2**30:.2f} GiB")
+def say_peak_memory(spent: Spent) -> None:
+    """Print the peak memory of the largest process."""
+    say(f"peak memory {spent.peak_bytes / 2**30:.2f} GiB")
 
 
 def print_import(summary: ImportSummary) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 import time
 from dataclasses import dataclass
 from typing import Protocol
@@ -13,16 +14,26 @@ _written_bytes = 0
 
 @dataclass(frozen=True, slots=True)
 class Spent:
-    """Resources that processes have used: CPU seconds of all threads, and bytes written."""
+    """Resources that processes have used.
+
+    Attributes:
+        cpu_s: CPU seconds of all threads.
+        written_bytes: written to files.
+        peak_bytes: most memory that one of the processes ever held.
+    """
 
     cpu_s: float = 0.0
     written_bytes: int = 0
+    peak_bytes: int = 0
 
     def __add__(self, other: Spent) -> Spent:
-        return Spent(self.cpu_s + other.cpu_s, self.written_bytes + other.written_bytes)
+        written_bytes = self.written_bytes + other.written_bytes
+        peak_bytes = max(self.peak_bytes, other.peak_bytes)
+        return Spent(self.cpu_s + other.cpu_s, written_bytes, peak_bytes)
 
     def __sub__(self, other: Spent) -> Spent:
-        return Spent(self.cpu_s - other.cpu_s, self.written_bytes - other.written_bytes)
+        written_bytes = self.written_bytes - other.written_bytes
+        return Spent(self.cpu_s - other.cpu_s, written_bytes, self.peak_bytes)
 
 
 def wrote(num_bytes: int) -> None:
@@ -33,7 +44,8 @@ def wrote(num_bytes: int) -> None:
 
 def spent_here() -> Spent:
     """Return the resources that this process has used so far."""
-    return Spent(time.process_time(), _written_bytes)
+    peak_bytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    return Spent(time.process_time(), _written_bytes, peak_bytes)
 
 
 @dataclass(frozen=True, slots=True)

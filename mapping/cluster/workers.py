@@ -34,6 +34,9 @@ ONE_THREAD = {
     "OPENCV_FOR_THREADS_NUM": "1",
 }
 
+# What the tasks of a build need beside networks.
+_PRELOADED = ("mapping.build.build",)
+
 # Items sent together: few, so that progress shows and all workers stay busy to the end.
 _MAX_BATCH, _MIN_BATCHES = 16, 200
 
@@ -48,10 +51,8 @@ class Workers:
     """
 
     def __init__(self, count: int) -> None:
-        # A forked child of a process that has used torch hangs.
-        spawn = multiprocessing.get_context("spawn")
         self._pool = (
-            ProcessPoolExecutor(count, mp_context=spawn, initializer=_start_worker)
+            ProcessPoolExecutor(count, mp_context=_forking(), initializer=_start_worker)
             if count > 1
             else None
         )
@@ -97,6 +98,18 @@ class Workers:
     ) -> None:
         with one_thread_here():
             task(item, progress)
+
+
+def _forking() -> multiprocessing.context.BaseContext:
+    """Return a way to start processes: forks of a server that has loaded what they need.
+
+    Loading takes seconds of each process otherwise, and its memory is shared. The server computes
+    nothing: a forked child of a process that has used torch hangs.
+    """
+    context = multiprocessing.get_context("forkserver")
+    needed = [*_PRELOADED, *(["torch"] if "torch" in sys.modules else [])]
+    context.set_forkserver_preload(needed)
+    return context
 
 
 def in_batches(items: Sequence[T]) -> list[Sequence[T]]:

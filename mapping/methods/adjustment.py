@@ -31,7 +31,7 @@ _LOSS_SCALE_PX, _LEAST_CHANGE = 1.0, 1e-6
 _MOST_STEPS = 100
 # Most steps between two reports of progress. Of large models fewer: a step takes about a second for
 # a million observations.
-_STEPS, _OBSERVED_IN_STEPS = 5, 2_500_000
+_STEPS, _OBSERVED_IN_STEPS = 10, 2_500_000
 # Models of fewer photos are adjusted more closely while they grow, as in COLMAP.
 _FEW_PHOTOS, _CLOSER = 10, 10.0
 # A step that went as foreseen lets the next one go further by this factor (Ceres).

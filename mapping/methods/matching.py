@@ -32,7 +32,7 @@ from visloc.matching.verification import epipolar_errors
 from visloc.pose.colmap import normalized_rays
 
 # Raised when the code of a stage here changes what comes out.
-_REVISION = {"matches": 2, "fixed_things": 1, "verified": 4}
+_REVISION = {"matches": 2, "fixed_things": 2, "verified": 5}
 # Partners of a photo with which it is asked what is fixed to the picture: enough for all photos
 # together.
 _MOST_ASKED = 8
@@ -230,13 +230,12 @@ class _MatchTask:
         def compute() -> Item:
             if self.given is not None:
                 return _item(self._given(group, self.given))
-            own = round_descriptors(self.features.read(group.photo).descriptors)
-            found = []
-            for partner in group.partners:
-                theirs = round_descriptors(self.features.read(partner).descriptors)
-                i, j, _ = mutual_nearest_neighbours(own, theirs)
-                found.append(np.column_stack([i, j]).astype(np.uint32))
-            return _item(found)
+            own, *others = (
+                round_descriptors(self.features.read(photo).descriptors)
+                for photo in (group.photo, *group.partners)
+            )
+            pairs = (mutual_nearest_neighbours(own, theirs)[:2] for theirs in others)
+            return _item([np.column_stack(rows).astype(np.uint32) for rows in pairs])
 
         if not self.work.has(self.matches_key(group)):
             self.work.get(self.matches_key(group), compute)

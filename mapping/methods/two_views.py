@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import poselib
 from numpy.typing import NDArray
 
-from visloc.geometry import Camera
+from visloc.geometry import Camera, Pose
+from visloc.matching.verification import epipolar_errors
 from visloc.pose.colmap import normalized_rays
 
 # Inliers are believed when chance gives so many at most once in 10^10 pairs with as many matches.
@@ -18,6 +21,8 @@ _SAMPLE = {True: 5, False: 7}
 _MIN_TRIALS, _MAX_TRIALS, _CONFIDENCE = 100, 2000, 0.999
 # PoseLib returns identity for fewer, or is not sure to end.
 _FEWEST = 8
+# Of more than twice so many matches, so many find the geometry if half of them fit it.
+_SOME, _CLEAR = 500, 0.5
 
 
 def fits_two_views(
@@ -56,25 +61,10 @@ def fits_two_views(
     usable = np.flatnonzero(finite if among is None else finite & among)
     if len(usable) < _FEWEST:
         return fits
-    options = {
-        "max_epipolar_error": max_error_px,
-        "min_iterations": _MIN_TRIALS,
-        "max_iterations": _MAX_TRIALS,
-        "success_prob": _CONFIDENCE,
-        "seed": 0,
-    }
     a, b = (points[usable] for points in seen)
-    if calibrated:
-        pinhole = {"model": "SIMPLE_PINHOLE", "width": 0, "height": 0, "params": [focal, 0.0, 0.0]}
-        pose, told = poselib.estimate_relative_pose(a, b, pinhole, pinhole, options, {})
-        cross = np.cross(np.eye(3), pose.t)
-        to_rays = np.diag([1 / focal, 1 / focal, 1.0])
-        fundamental = to_rays @ cross.T @ pose.R @ to_rays
-    else:
-        fundamental, told = poselib.estimate_fundamental(a, b, options, {})
-    found = np.array(told["inliers"], dtype=bool)
-    # Without a model, the mask is not all false.
-    if told["num_inliers"] < _FEWEST or len(found) != len(usable):
+    focal_px = focal if calibrated else None
+    fundamental, found = _estimated_by_some(a, b, focal_px, max_error_px)
+    if found.sum() < _FEWEST:
         return fits
     share = max(_share_near_a_line(camera, max_error_px) for camera in cameras)
     chance = log10_chance(len(usable), int(found.sum()), share, calibrated=calibrated)
@@ -86,6 +76,101 @@ def fits_two_views(
         errors = _sampson_errors(fundamental, *(points[others] for points in seen))
         fits[others[errors <= max_error_px]] = True
     return fits
+
+
+def _estimated_by_some(
+    a: NDArray[np.float64], b: NDArray[np.float64], focal_px: float | None, max_error_px: float
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return a fundamental matrix of matched pixels (n, 2), and which of them (n,) fit it.
+
+    A part of many matches finds it in a third of the time, and all refine it. Where few of the part
+    fit, all of them are searched: a weak pair needs each.
+    """
+    if len(a) > 2 * _SOME:
+        some = np.random.default_rng(0).permutation(len(a))[:_SOME]
+        found, inliers = _estimated(a[some], b[some], focal_px, max_error_px)
+        if inliers.mean() >= _CLEAR:
+            refined = _refined(found, a, b, focal_px, max_error_px)
+            return refined.fundamental, refined.fits(a, b, max_error_px)
+    found, inliers = _estimated(a, b, focal_px, max_error_px)
+    return found.fundamental, inliers
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _TwoViews:
+    """The geometry of two photos.
+
+    Attributes:
+        fundamental: (3, 3), of pixels.
+        pose: second camera from first, with centred pixels of this focal length; None when the
+            intrinsics are unknown.
+    """
+
+    fundamental: NDArray[np.float64]
+    pose: poselib.CameraPose | None = None
+    focal_px: float = 1.0
+
+    @staticmethod
+    def of(pose: poselib.CameraPose, focal_px: float) -> _TwoViews:
+        cross = np.cross(np.eye(3), pose.t)
+        to_rays = np.diag([1 / focal_px, 1 / focal_px, 1.0])
+        return _TwoViews(to_rays @ cross.T @ pose.R @ to_rays, pose, focal_px)
+
+    def fits(
+        self, a: NDArray[np.float64], b: NDArray[np.float64], max_error_px: float
+    ) -> NDArray[np.bool_]:
+        """Tell which matched pixels (n, 2) fit it, in front of both cameras."""
+        near = _sampson_errors(self.fundamental, a, b) <= max_error_px
+        if self.pose is None:
+            return np.asarray(near)
+        ones = np.ones((len(a), 1))
+        rays_a, rays_b = (np.hstack([pixels / self.focal_px, ones]) for pixels in (a, b))
+        errors = epipolar_errors(rays_a, rays_b, Pose(self.pose.R, self.pose.t))
+        return np.asarray(near & np.isfinite(errors))
+
+
+def _estimated(
+    a: NDArray[np.float64], b: NDArray[np.float64], focal_px: float | None, max_error_px: float
+) -> tuple[_TwoViews, NDArray[np.bool_]]:
+    options = {
+        "max_epipolar_error": max_error_px,
+        "min_iterations": _MIN_TRIALS,
+        "max_iterations": _MAX_TRIALS,
+        "success_prob": _CONFIDENCE,
+        "seed": 0,
+    }
+    if focal_px is None:
+        fundamental, told = poselib.estimate_fundamental(a, b, options, {})
+        found = _TwoViews(fundamental)
+    else:
+        camera = _pinhole(focal_px)
+        pose, told = poselib.estimate_relative_pose(a, b, camera, camera, options, {})
+        found = _TwoViews.of(pose, focal_px)
+    inliers = np.array(told["inliers"], dtype=bool)
+    # Without a model, the mask is not all false.
+    if told["num_inliers"] < _FEWEST or len(inliers) != len(a):
+        inliers = np.zeros(len(a), dtype=bool)
+    return found, inliers
+
+
+def _refined(
+    found: _TwoViews,
+    a: NDArray[np.float64],
+    b: NDArray[np.float64],
+    focal_px: float | None,
+    max_error_px: float,
+) -> _TwoViews:
+    options = {"loss_type": "TRUNCATED", "loss_scale": max_error_px}
+    if found.pose is None or focal_px is None:
+        return _TwoViews(poselib.refine_fundamental(a, b, found.fundamental, options)[0])
+    camera = _pinhole(focal_px)
+    pose, _ = poselib.refine_relative_pose(a, b, found.pose, camera, camera, options)
+    return _TwoViews.of(pose, focal_px)
+
+
+def _pinhole(focal_px: float) -> dict[str, Any]:
+    params = [focal_px, 0.0, 0.0]
+    return {"model": "SIMPLE_PINHOLE", "width": 0, "height": 0, "params": params}
 
 
 def _sampson_errors(

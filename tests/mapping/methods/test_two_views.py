@@ -32,6 +32,33 @@ def test_right_matches_fit_and_most_wrong_ones_do_not(calibrated: bool) -> None:
     assert fits[120:].mean() < 0.15
 
 
+# A part of the matches finds the geometry, and where too few of the part fit, all do.
+@pytest.mark.parametrize(("num_right", "num_wrong"), [(2000, 500), (600, 900)])
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_of_many_matches_the_right_ones_fit(
+    calibrated: bool, num_right: int, num_wrong: int
+) -> None:
+    a, b = two_photos(num_right, num_wrong)
+    fits = fits_two_views((CAMERA, CAMERA), a, b, 4.0, calibrated=calibrated)
+    assert fits[:num_right].mean() > 0.97
+    assert fits[num_right:].mean() < 0.1
+
+
+def test_of_many_matches_those_behind_the_cameras_do_not_fit() -> None:
+    a, b = two_photos(2000, 0)
+    # Pixels whose rays meet behind: those of points seen with the baseline reversed.
+    points = np.random.default_rng(2).uniform([-2, -1.5, 4], [2, 1.5, 8], (100, 3))
+    reversed_second = Pose(np.eye(3), -SECOND.translation)
+    behind = project(CAMERA, points), project(CAMERA, reversed_second.apply(points))
+    a, b = (
+        np.concatenate([one, other]).astype(np.float32)
+        for one, other in zip((a, b), behind, strict=True)
+    )
+    fits = fits_two_views((CAMERA, CAMERA), a, b, 4.0, calibrated=True)
+    assert fits[:2000].mean() > 0.97
+    assert not fits[2000:].any()
+
+
 @pytest.mark.parametrize("calibrated", [True, False])
 def test_wrong_matches_alone_never_fit(calibrated: bool) -> None:
     a, b = two_photos(0, 1000)
