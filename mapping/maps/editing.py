@@ -201,9 +201,11 @@ def joined(a: MapContent, b: MapContent, same: NDArray[np.int64] | None = None) 
 
     Raises:
         Conflict: ``merge.photos`` when both have photos of one name, ``merge.features`` when
-            their local features differ.
+            their local features differ, ``merge.landmarks`` when one alone has landmarks.
     """
     refuse_other_features(a, b)
+    if bool(len(a.landmarks.points)) != bool(len(b.landmarks.points)):
+        raise refuse("merge.landmarks", field="MAP")
     names = {image.name for image in a.images}
     both = [image.name for image in b.images if image.name in names]
     if both:
@@ -267,8 +269,11 @@ def _joined_landmarks(a: Landmarks, b: Landmarks, same: NDArray[np.int64] | None
     known = np.full(len(b.points), -1) if same is None else same
     new = known < 0
     row_of = np.where(new, count + np.cumsum(new) - 1, known)
-    observed = row_of[b.observed]
-    again = np.bincount(observed[observed < count], minlength=count)
+    if len(b.points):
+        observed = row_of[b.observed]
+        again = np.bincount(observed[observed < count], minlength=count)
+    else:  # without landmarks, observations name themselves
+        observed, again = len(a.observed) + b.observed.astype(np.int64), np.zeros(count, np.int64)
     lengths = np.minimum(a.track_lengths + again, 65535).astype(np.uint16)
     points = (b.points[new] + (b.origin - a.origin)).astype(np.float32)
     # Colours of some landmarks alone are none of the map.

@@ -16,6 +16,9 @@ from visloc.archive import Anchor, Map
 from visloc.errors import refuse
 
 
+RETRIEVAL_ONLY = "retrieval-only"
+
+
 def no_landmarks(
     context: BuildContext, photos: Sequence[MappingPhoto], *, metric: bool
 ) -> MadeLandmarks:
