@@ -15,7 +15,6 @@ from mapping.stages.photos import MappingPhoto
 from visloc.archive import Anchor, Map
 from visloc.errors import refuse
 
-
 RETRIEVAL_ONLY = "retrieval-only"
 
 

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from mapping.methods.retrieval_only import RETRIEVAL_ONLY
 from mapping.methods.rgbd import DepthSettings
 from mapping.options import (
     AcceptOption,
@@ -23,7 +24,6 @@ from mapping.options import (
     WeightsDirOption,
     WorkersOption,
 )
-from mapping.methods.retrieval_only import RETRIEVAL_ONLY
 from visloc.archive import Map
 from visloc.archive.schema import ID_PATTERN
 from visloc.errors import refuse

@@ -253,7 +253,7 @@ def test_two_maps_without_landmarks_merge(
     assert np.abs(merged.registration.tie.there_from_here.translation).max() < 0.05
 
 
-def test_a_set_takes_maps_without_landmarks(bare: Map, store: MapStore, walk: Path) -> None:
+def test_a_set_takes_maps_without_landmarks(bare: Map, store: MapStore) -> None:
     tiles = [(bare.manifest.id, Similarity.identity())]
     opened = open_set(publish_set(store, "tiles", tiles, quiet))
     assert opened.manifest.counts.landmarks == 0
