@@ -30,13 +30,36 @@ interface Asked {
   camera?: Camera | null;
 }
 
+/** Where a satellite receiver has the device, such as `coords` of the browser's geolocation. */
+export interface GnssPrior {
+  /** Degrees, WGS84. */
+  latitude: number;
+  longitude: number;
+  /** Metres: the horizontal radius that holds 68 % of fixes. */
+  accuracy: number;
+  /** Metres above the ellipsoid, with its accuracy. */
+  altitude?: number | null;
+  vertical_accuracy?: number | null;
+}
+
+/** What is known of the place beforehand (docs/api.md, "Priors"). */
+export interface Priors {
+  /** x, y, z in the world, and a radius in its unit. */
+  position?: { position: number[]; radius: number };
+  height?: { min: number; max: number };
+  pose?: { device_from_world: Transform; covariance: number[] };
+  gravity?: { direction: number[]; std_deg?: number; world?: number[] };
+  gnss?: GnssPrior;
+  /** Tiles of a set that the device may be in. */
+  maps?: string[];
+}
+
 /** Where to look, and how: the fields of docs/api.md. */
 interface Where {
   /** An id or `id@version`. */
   map: string;
   options?: Record<string, string | number>;
-  /** What is known of the place beforehand. */
-  priors?: unknown;
+  priors?: Priors;
 }
 
 export interface LocalizeCall extends Where, Asked {
