@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import time
+import hashlib
+import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -98,13 +100,25 @@ class DatasetRun(Photos, QueryOptions):
         """Read the pairs, if there are any; raises as ``read_query_pairs``."""
         return None if self.pairs is None else read_query_pairs(self.pairs, queries.photos)
 
-    def further(self, mode: Mode, arrangement: Arrangement) -> dict[str, object]:
-        """Return the options that count for a mode and a list, for the description of a run."""
+    def further(
+        self,
+        mode: Mode,
+        arrangement: Arrangement,
+        pairs: Mapping[str, tuple[str, ...]] | None,
+    ) -> dict[str, object]:
+        """Return the options that count for a mode and a list, for the description of a run.
+
+        Of pairs, also a hash of what was read: a file of this name may change.
+        """
         told: dict[str, object] = {}
         if self.image_root is not None:
             told["image_root"] = str(self.image_root.resolve())
         if self.pairs is not None:
-            told["pairs"] = str(self.pairs.resolve())
+            read = json.dumps(pairs, sort_keys=True).encode()
+            told |= {
+                "pairs": str(self.pairs.resolve()),
+                "pairs_sha256": hashlib.sha256(read).hexdigest(),
+            }
         if mode is Mode.GP3P:
             told["rig"] = self.rig
         elif mode.fills_sequences:
@@ -144,7 +158,7 @@ def localize_batch(
     read = run.reader(info)
     batch = Batch(
         *(output, run.source, run.features_dir, run.pixel_origin, info.ref, options, mode),
-        run.further(mode, arrangement),
+        run.further(mode, arrangement, pairs),
     )
     done = open_batch(batch, restart=restart)
     photos = queries.photos
