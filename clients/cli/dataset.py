@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
-import time
 import hashlib
 import json
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial

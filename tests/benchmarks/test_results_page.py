@@ -78,7 +78,7 @@ def test_what_was_measured_is_not_measured_again(
     )
     table = Table({"": (str(script), "DATA/castle")})
     monkeypatch.setattr(command, "TABLES", {"one": table})
-    monkeypatch.setattr(command, "commit_of", lambda root: "abc1234")
+    monkeypatch.setattr(command, "commit_of", lambda _: "abc1234")
     for _ in range(2):
         command.main(["one"], tmp_path / "data", tmp_path / "work", measure_only=True)
     shown = capsys.readouterr().out
@@ -86,7 +86,7 @@ def test_what_was_measured_is_not_measured_again(
     assert counted.read_text() == "x"
     measured = json.loads((tmp_path / "work" / "abc1234" / "one.json").read_text())
     assert measured["commit"] == "abc1234"
-    monkeypatch.setattr(command, "commit_of", lambda root: "abc1234+")  # files may have changed
+    monkeypatch.setattr(command, "commit_of", lambda _: "abc1234+")  # files may have changed
     for _ in range(2):
         command.main(["one"], tmp_path / "data", tmp_path / "work", measure_only=True)
     assert counted.read_text() == "xxx"

@@ -117,9 +117,7 @@ describe("the form of a photo", () => {
     });
     expect(form.get("camera")).toBe("PINHOLE,640,480,525,525.5,320,240");
     expect(form.get("options")).toBe('{"top_k":5}');
-    expect(form.get("priors")).toBe(
-      '{"gnss":{"latitude":48.1,"longitude":8.2,"accuracy":4.5}}',
-    );
+    expect(form.get("priors")).toBe('{"gnss":{"latitude":48.1,"longitude":8.2,"accuracy":4.5}}');
     expect(form.get("debug")).toBe("true");
     expect((form.get("image") as File).name).toBe('a "b".jpg');
   });
