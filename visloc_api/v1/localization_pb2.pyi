@@ -276,10 +276,32 @@ class Features(_message.Message):
         def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
         def WhichOneof(self, oneof_group: _Never) -> None: ...
 
+    @_typing.final
+    class MatchesEntry(_message.Message):
+        DESCRIPTOR: _descriptor.Descriptor
+
+        KEY_FIELD_NUMBER: _builtins.int
+        VALUE_FIELD_NUMBER: _builtins.int
+        key: _builtins.str
+        @_builtins.property
+        def value(self) -> Global___Array: ...
+        def __init__(
+            self,
+            *,
+            key: _builtins.str = ...,
+            value: Global___Array | None = ...,
+        ) -> None: ...
+        _HasFieldArgType: _TypeAlias = _typing.Literal["value", b"value"]  # noqa: Y015
+        def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+        _ClearFieldArgType: _TypeAlias = _typing.Literal["key", b"key", "value", b"value"]  # noqa: Y015
+        def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+        def WhichOneof(self, oneof_group: _Never) -> None: ...
+
     KIND_FIELD_NUMBER: _builtins.int
     KEYPOINTS_FIELD_NUMBER: _builtins.int
     DESCRIPTORS_FIELD_NUMBER: _builtins.int
     GLOBAL_DESCRIPTORS_FIELD_NUMBER: _builtins.int
+    MATCHES_FIELD_NUMBER: _builtins.int
     kind: _builtins.str
     """the map's local_features"""
     @_builtins.property
@@ -296,6 +318,12 @@ class Features(_message.Message):
         features, such as localvlad, may be left out.
         """
 
+    @_builtins.property
+    def matches(self) -> _containers.MessageMap[_builtins.str, Global___Array]:
+        """By the name of a mapping photo, k x 3: the row of a keypoint, and x, y of the photo's keypoint
+        that it is matched with. When there are any, they replace the service's own matching.
+        """
+
     def __init__(
         self,
         *,
@@ -303,10 +331,11 @@ class Features(_message.Message):
         keypoints: Global___Array | None = ...,
         descriptors: Global___Array | None = ...,
         global_descriptors: _abc.Mapping[_builtins.str, Global___Array] | None = ...,
+        matches: _abc.Mapping[_builtins.str, Global___Array] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["descriptors", b"descriptors", "keypoints", b"keypoints"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["descriptors", b"descriptors", "global_descriptors", b"global_descriptors", "keypoints", b"keypoints", "kind", b"kind"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["descriptors", b"descriptors", "global_descriptors", b"global_descriptors", "keypoints", b"keypoints", "kind", b"kind", "matches", b"matches"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -18,6 +18,11 @@ export interface Features {
   descriptors: FeatureArray;
   /** D numbers for each of the map's `global_features`. */
   global_descriptors: Record<string, FeatureArray>;
+  /**
+   * By the name of a mapping photo, k x 3: the row of a keypoint, and x, y of the photo's keypoint
+   * that another program matched it with. When there are any, the service matches nothing itself.
+   */
+  matches?: Record<string, FeatureArray>;
 }
 
 /** A photo, or what was found in it, with its intrinsics where they are known. */
@@ -122,7 +127,8 @@ export function rigForm(call: RigCall): FormData {
 
 const blobOf = (photo: Photo): Blob => (photo instanceof Blob ? photo : new Blob([photo]));
 
-function featuresJson({ kind, keypoints, descriptors, global_descriptors }: Features): unknown {
+function featuresJson(features: Features): unknown {
+  const { kind, keypoints, descriptors, global_descriptors, matches } = features;
   const count = keypoints.length / 2;
   const described = Object.entries(global_descriptors).map(([name, numbers]): [string, unknown] => [
     name,
@@ -133,7 +139,16 @@ function featuresJson({ kind, keypoints, descriptors, global_descriptors }: Feat
     keypoints: arrayJson(keypoints, [count, 2]),
     descriptors: arrayJson(descriptors, [count, count > 0 ? descriptors.length / count : 0]),
     global_descriptors: Object.fromEntries(described),
+    ...(matches === undefined ? {} : { matches: matchesJson(matches) }),
   };
+}
+
+function matchesJson(matches: Record<string, FeatureArray>): unknown {
+  const arrays = Object.entries(matches).map(([name, rows]): [string, unknown] => [
+    name,
+    arrayJson(rows, [rows.length / 3, 3]),
+  ]);
+  return Object.fromEntries(arrays);
 }
 
 /** Little-endian, as every machine that runs JavaScript is. */
