@@ -18,6 +18,7 @@ from visloc.archive import (
     pose_row,
 )
 from visloc.archive.checks import read_record
+from visloc.archive.gnss import read_fixes
 from visloc.archive.npz import read_npz
 from visloc.archive.schema import CamerasFile
 from visloc.archive.writer import PoseRow
@@ -84,6 +85,7 @@ def content_of(opened: Map) -> MapContent:
         descriptor_scale=scale,
         own_test=manifest.parts.own_test,
         index=IndexKind.IVF if opened.has_index else IndexKind.AUTO,
+        fixes=read_fixes(opened),
     )
 
 
@@ -225,6 +227,7 @@ def joined(a: MapContent, b: MapContent, same: NDArray[np.int64] | None = None) 
         image_poses=np.concatenate([a.image_poses, b.image_poses]),
         landmarks=_joined_landmarks(a.landmarks, b.landmarks, same),
         max_keypoints=max(a.max_keypoints, b.max_keypoints),
+        fixes=a.fixes.joined(b.fixes) if a.fixes and b.fixes else a.fixes or b.fixes,
         descriptors=lambda: _chained(a, b),
         global_features=tuple(
             _joined_rows(one, other)

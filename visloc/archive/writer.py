@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pydantic import JsonValue
 
 from visloc.archive.checks import SCALES, content_hash, json_text, manifest_hash, sha256_of
+from visloc.archive.gnss import GNSS_FILE, Fixes
 from visloc.archive.index_files import index_files
 from visloc.archive.schema import (
     FORMAT,
@@ -110,6 +111,7 @@ class MapContent:
             were read from stores them unchanged; None chooses one that fits the largest value.
         own_test: of a map that this is or is a part of; None when it took none.
         index: whether an inverted file of the global descriptors is written.
+        fixes: of GNSS receivers during the captures.
     """
 
     metric: bool
@@ -133,6 +135,7 @@ class MapContent:
     descriptor_scale: float | None = None
     own_test: OwnTest | None = None
     index: IndexKind = IndexKind.AUTO
+    fixes: Fixes | None = None
 
 
 def pose_row(pose: Pose) -> PoseRow:
@@ -159,6 +162,8 @@ def write_map(folder: Path, content: MapContent, *, map_id: str, version: str, c
     """
     files, landmarks = Files(folder), content.landmarks
     _write_images(files, content)
+    if content.fixes is not None:
+        files.write_json(GNSS_FILE, content.fixes.model_dump())
     _write_landmarks(files, landmarks)
     keypoint_step = _write_keypoints(files, landmarks.keypoints, content.cameras)
     scale = _write_descriptors(
