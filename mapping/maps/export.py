@@ -17,7 +17,7 @@ from mapping.maps.colmap_database import (
     matches_of_tracks,
     write_colmap_database,
 )
-from mapping.maps.colmap_queries import match_queries
+from mapping.maps.colmap_queries import match_queries, usable_queries
 from mapping.methods.retrieval_only import refuse_without_landmarks
 from mapping.stages.imported_points import ImportedPoints, read_imported_points
 from mapping.stages.landmarks import Observations, View, reprojection_errors
@@ -83,7 +83,8 @@ def export_map(
 
     Raises:
         InvalidInput: ``export.unknown_format``; ``export.queries`` for another format, or for a map
-            of an imported reconstruction whose points are not those that queries are matched with.
+            of an imported reconstruction whose points are not those that queries are matched with;
+            ``export.no_queries`` when no photo can be added.
         Conflict: ``export.exists``; ``map.no_landmarks``.
         DatasetError: ``kapture.field`` for a name that kapture cannot hold.
     """
@@ -94,6 +95,8 @@ def export_map(
         format_name != "colmap" or read_imported_points(opened) is not None
     ):
         raise refuse("export.queries", field="--queries", got=f"{format_name} of {opened.ref}")
+    if queries is not None and not usable_queries(opened, queries.dataset):
+        raise refuse("export.no_queries", field="--queries", got=str(queries.dataset.root))
     refuse_without_landmarks(opened)
     with complete_output(output, "export.exists") as partial:
         notes = export(opened, partial)
