@@ -138,6 +138,9 @@ bench-scale: install ## maps of 100 to 100 000 images: opening, memory, retrieva
 bench-change: install ## other light, weather and cameras: where photos are lost, as in docs/change.md
 	$(BIN)/python -m benchmarks.change $(ARGS)
 
+results: install ## measure tables of docs/results.md, or ONLY these, and stamp them; goes on where it stopped
+	nice -n 5 $(BIN)/python -m benchmarks.results $(ONLY) $(ARGS)
+
 trust: install ## how far an answer can be trusted: every figure of docs/trust.md
 	$(BIN)/python -m benchmarks.trust $(ARGS)
 
@@ -176,4 +179,4 @@ serve: install ## serve the maps in maps/ on 127.0.0.1:8000 (HTTP) and :50051 (g
 	$(BIN)/python -m service --maps-dir maps
 
 clean: ## remove what make made
-	rm -rf $(VENV) .site .site-links .sbom .demo .bench .change .trust web/node_modules web/client/dist visloc_web/built
+	rm -rf $(VENV) .site .site-links .sbom .demo .bench .change .results .trust web/node_modules web/client/dist visloc_web/built

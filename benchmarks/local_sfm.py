@@ -9,6 +9,7 @@ first time may triangulate; the second time, its place is known.
 from __future__ import annotations
 
 import time
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,7 @@ from visloc.types import Localized
 
 
 def main(maps_dir: Path, map_id: str, queries: Path, every: int = 1) -> None:
-    """Print how many are localized, how far off, how often the deviations hold, and the seconds."""
+    """Print a row: how many are localized, how far off, how often deviations hold, and seconds."""
     opened = MapStore(maps_dir).open(map_id)
     extractor = make_local_features(opened.manifest.local_features.fingerprint.name)
     began = time.perf_counter()
@@ -53,12 +54,18 @@ def main(maps_dir: Path, map_id: str, queries: Path, every: int = 1) -> None:
         inside += bool((off <= 3.0 * answer.position_std).all())
     position, angle = np.array(errors).reshape(-1, 2).T
     typer.echo(
-        f"{opened.ref}: {len(errors)} of {len(records)} localized ({', '.join(reasons) or 'all'}); "
-        f"position: median {np.median(position):.4f}, 90 % {np.quantile(position, 0.9):.4f}, "
-        f"largest {position.max():.4f}; orientation: median {np.median(angle):.3f} deg, largest "
-        f"{angle.max():.2f}; within 3 stated deviations: {inside}; seconds per query: at first "
-        f"median {np.median(seconds[0]):.2f}, most {max(seconds[0]):.2f}, again "
-        f"{np.median(seconds[1]):.2f}; start {started:.1f}"
+        "| localized | refused | position: median, 90 %, largest | orientation: median, largest | "
+        "within 3 stated deviations | seconds: first, most, again, start |"
+    )
+    typer.echo("|---|---|---|---|---|---|")
+    unit, times = ("cm", 100.0) if opened.manifest.world.metric else ("units", 1.0)
+    quantiles = times * np.quantile(position, [0.5, 0.9, 1.0])
+    refused = ", ".join(f"{number} {reason}" for reason, number in Counter(reasons).items())
+    typer.echo(
+        f"| {len(errors)} of {len(records)} | {refused} | "
+        f"{', '.join(f'{each:.3g}' for each in quantiles)} {unit} | {np.median(angle):.3f}, "
+        f"{angle.max():.2f} deg | {inside} of {len(errors)} | {np.median(seconds[0]):.2f}, "
+        f"{max(seconds[0]):.2f}, {np.median(seconds[1]):.2f}, {started:.1f} |"
     )
 
 

@@ -5,7 +5,7 @@ from clients.frames import Axes, blended, camera_matrix, session_from_map
 from clients.wire.answers import ImageResult, InstantResult, LocalizeResult, ServerInfo
 from clients.wire.features import Features
 from clients.wire.rigs import Instant, Rig, RigImage
-from visloc.priors import GravityPrior, HeightBand, PosePrior, PositionPrior, Priors
+from visloc.priors import GnssPrior, GravityPrior, HeightBand, PosePrior, PositionPrior, Priors
 from visloc.sequences.filling import Odometry
 from visloc.types import MaskedImage, Near, PoseSource, RigSensor
 from visloc_api.words.answers import (
@@ -34,6 +34,7 @@ __all__ = [
     "GeoPose",
     "GeoPoseYpr",
     "Geodetic",
+    "GnssPrior",
     "GravityPrior",
     "HeightBand",
     "ImageResult",

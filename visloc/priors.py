@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.errors import VislocError, refuse
-from visloc.geometry import Pose
+from visloc.geometry import Pose, Similarity
 
 # A gravity prior of a larger spread says too little to search by.
 MAX_GRAVITY_STD = math.radians(15.0)
@@ -27,6 +27,9 @@ REACH = 2.0
 HEIGHT_REACH = 0.25
 # An area of so many standard deviations around a pose prior is searched.
 POSE_PRIOR_STDS = 3.0
+# The device may be so many times the accuracy of a GNSS fix away from it: beside buildings, errors
+# have long tails.
+GNSS_ACCURACIES = 3.0
 # Most tiles of a set of maps. The manifest lists them, which takes about 12 MB for so many.
 MAX_TILES = 10_000
 # Limit on positions and uncertainties. It exceeds any real value, and its squares stay finite.
@@ -127,6 +130,59 @@ class GravityPrior:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class GnssPrior:
+    """The device is where a satellite receiver has it, give or take.
+
+    Needs a map that knows where it lies on Earth.
+
+    Attributes:
+        latitude: degrees, WGS84.
+        longitude: degrees.
+        accuracy: horizontal radius that holds 68 % of fixes, as phones state it; metres, positive.
+        altitude: metres above the ellipsoid; None when unknown.
+        vertical_accuracy: of the altitude, metres, positive; None without an altitude.
+        fix_from_world: from the world to metres east, north and up of the fix; None for what the
+            map knows of its place on Earth. In a tile it is what the set knows
+            (``visloc.archive.places.located``). Altitude 0 stands for one that is unknown.
+    """
+
+    latitude: float
+    longitude: float
+    accuracy: float
+    altitude: float | None = None
+    vertical_accuracy: float | None = None
+    fix_from_world: Similarity | None = None
+
+    def __post_init__(self) -> None:
+        for part, most in (("latitude", 90.0), ("longitude", 180.0), ("altitude", _MOST)):
+            value = getattr(self, part)
+            if value is not None and not abs(value) <= most:  # NaN fails too
+                raise _unusable("gnss", part, f"a number from {-most:g} to {most:g}", value)
+        if (self.altitude is None) != (self.vertical_accuracy is None):
+            expected = "an altitude and its accuracy, or neither"
+            raise _unusable("gnss", "vertical_accuracy", expected, self.vertical_accuracy)
+        for part in ("accuracy", "vertical_accuracy"):
+            value = getattr(self, part)
+            if value is not None and not 0 < value <= _MOST:
+                expected = f"a positive number of metres, at most {_MOST:g}"
+                raise _unusable("gnss", part, expected, value)
+
+    def beyond(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how far points (n, 3) of the world lie outside what the fix allows, metres (n,).
+
+        It allows a cylinder about the fix; one without ends when the altitude is unknown.
+        """
+        if self.fix_from_world is None:
+            raise AssertionError("nobody said where the world lies on Earth")
+        enu = self.fix_from_world.apply(points)
+        outside = np.hypot(enu[:, 0], enu[:, 1]) - GNSS_ACCURACIES * self.accuracy
+        if self.vertical_accuracy is None:
+            return np.asarray(np.maximum(outside, 0.0))
+        above = np.abs(enu[:, 2]) - GNSS_ACCURACIES * self.vertical_accuracy
+        return np.hypot(np.maximum(outside, 0.0), np.maximum(above, 0.0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Priors:
     """What is known; None where nothing is.
 
@@ -138,6 +194,7 @@ class Priors:
     height: HeightBand | None = None
     pose: PosePrior | None = None
     gravity: GravityPrior | None = None
+    gnss: GnssPrior | None = None
     maps: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:

@@ -101,12 +101,16 @@ class QueryFeatures:
             is (0.5, 0.5).
         descriptors: (N, D) numbers of any length.
         global_descriptors: by name, as the map has it, (D,) numbers of any length.
+        matches: by the name of a mapping photo, (k, 3) numbers: the row of a keypoint, and x, y of
+            the keypoint of that photo which it is matched with, in pixels of its camera. When there
+            are any, they replace matching by descriptors.
     """
 
     kind: str
     keypoints: NDArray[np.generic]
     descriptors: NDArray[np.generic]
     global_descriptors: Mapping[str, NDArray[np.generic]] = field(default_factory=dict)
+    matches: Mapping[str, NDArray[np.generic]] = field(default_factory=dict)
 
 
 class PoseSource(StrEnum):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -32,6 +33,9 @@ from clients.evaluation.pairs import read_query_pairs
 from clients.evaluation.queries import QuerySet
 from clients.evaluation.results import check_can_be_written, write_poses, write_whole
 from clients.evaluation.run import InstantOutcome, Outcome, QueryClient, localize_all
+from clients.evaluation.sent_matches import PhotoMatches
+from visloc.errors import refuse
+from visloc.kapture.matches import open_matches
 from visloc.sequences.filling import DEFAULT_MAX_GAP_S, TimeUnit
 from visloc_api.words.maps import MapInfo
 from visloc_api.words.poses import PoseEstimate
@@ -85,6 +89,16 @@ class DatasetRun(Photos, QueryOptions):
         ),
     ] = None
 
+    matches_dir: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="For a map of ready-made features: matches of the photos with those of --pairs, "
+            "in kapture's layout (reconstruction/matches/TYPE), instead of the server's own. The "
+            "features of both are in the same folder.",
+        ),
+    ] = None
+
     def arrange(self, queries: QuerySet, modes: Sequence[Mode], info: MapInfo) -> Arrangement:
         """Group the photos as the modes need it; raises as ``arrange``."""
         return arrange(
@@ -98,13 +112,40 @@ class DatasetRun(Photos, QueryOptions):
         """Read the pairs, if there are any; raises as ``read_query_pairs``."""
         return None if self.pairs is None else read_query_pairs(self.pairs, queries.photos)
 
-    def further(self, mode: Mode, arrangement: Arrangement) -> dict[str, object]:
-        """Return the options that count for a mode and a list, for the description of a run."""
+    def read_matches(self, pairs: Mapping[str, tuple[str, ...]] | None) -> PhotoMatches | None:
+        """Open the matches, if there are any.
+
+        Raises:
+            InvalidInput: ``queries.matches_dir`` without pairs.
+            DatasetError: as ``open_matches``.
+        """
+        if self.matches_dir is None:
+            return None
+        if pairs is None:
+            raise refuse("queries.matches_dir", field="--pairs", got="none")
+        return PhotoMatches(open_matches(self.matches_dir), pairs)
+
+    def further(
+        self,
+        mode: Mode,
+        arrangement: Arrangement,
+        pairs: Mapping[str, tuple[str, ...]] | None,
+    ) -> dict[str, object]:
+        """Return the options that count for a mode and a list, for the description of a run.
+
+        Of pairs, also a hash of what was read: a file of this name may change.
+        """
         told: dict[str, object] = {}
         if self.image_root is not None:
             told["image_root"] = str(self.image_root.resolve())
         if self.pairs is not None:
-            told["pairs"] = str(self.pairs.resolve())
+            read = json.dumps(pairs, sort_keys=True).encode()
+            told |= {
+                "pairs": str(self.pairs.resolve()),
+                "pairs_sha256": hashlib.sha256(read).hexdigest(),
+            }
+        if self.matches_dir is not None:
+            told["matches_dir"] = str(self.matches_dir.resolve())
         if mode is Mode.GP3P:
             told["rig"] = self.rig
         elif mode.fills_sequences:
@@ -138,13 +179,14 @@ def localize_batch(
     """
     options, queries = run.options, run.read()
     pairs = run.read_pairs(queries)
+    matches = run.read_matches(pairs)
     with connection.client() as client:
         info = client.map(run.map_ref)
     arrangement = run.arrange(queries, [mode], info)
-    read = run.reader(info)
+    read = run.reader(info, matches=matches)
     batch = Batch(
         *(output, run.source, run.features_dir, run.pixel_origin, info.ref, options, mode),
-        run.further(mode, arrangement),
+        run.further(mode, arrangement, pairs),
     )
     done = open_batch(batch, restart=restart)
     photos = queries.photos
@@ -211,10 +253,9 @@ def benchmark(
     with connection.client() as client:
         info, about = client.map(run.map_ref), client.server_info()
     arrangement = run.arrange(queries, modes, info)
-    read = run.reader(info)
-    ask = partial(
-        QueryClient, map_ref=info.ref, options=options, read=read, pairs=run.read_pairs(queries)
-    )
+    pairs = run.read_pairs(queries)
+    read = run.reader(info, matches=run.read_matches(pairs))
+    ask = partial(QueryClient, map_ref=info.ref, options=options, read=read, pairs=pairs)
     timed = {
         in_instants: _timed(connection, ask, arrangement, run.concurrency, in_instants=in_instants)
         for in_instants in sorted({mode is Mode.GP3P for mode in modes})

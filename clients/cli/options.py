@@ -22,6 +22,7 @@ from clients.client import DEFAULT_TIMEOUT_S, AsyncClient, Client
 from clients.evaluation.benchmark import parse_threshold
 from clients.evaluation.queries import QuerySet, read_queries
 from clients.evaluation.readers import Reader, choose_reader
+from clients.evaluation.sent_matches import PhotoMatches
 from clients.wire.options import options_from_texts
 from visloc.errors import refuse
 from visloc.evaluation import DEFAULT_THRESHOLDS, Threshold
@@ -202,10 +203,16 @@ class Photos:
         """Read the list of photos; raises as ``read_queries``."""
         return read_queries(self.source, self.pixel_origin, self.image_root)
 
-    def reader(self, info: MapInfo, *, with_features_dir: bool = True) -> Reader:
+    def reader(
+        self,
+        info: MapInfo,
+        *,
+        with_features_dir: bool = True,
+        matches: PhotoMatches | None = None,
+    ) -> Reader:
         """Choose what is sent to a map; raises as ``choose_reader``."""
         features_dir = self.features_dir if with_features_dir else None
-        return choose_reader(self.source, info, features_dir, self.pixel_origin)
+        return choose_reader(self.source, info, features_dir, self.pixel_origin, matches)
 
 
 _DEFAULT_THRESHOLDS = [

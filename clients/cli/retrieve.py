@@ -15,6 +15,7 @@ from clients.cli.progress import run_with_progress
 from clients.evaluation.pairs import write_query_pairs
 from clients.evaluation.results import check_can_be_written
 from clients.evaluation.run import Outcome, QueryClient, localize_all
+from visloc.kapture.pairs import check_pair_names
 
 _out = Console()
 _err = Console(stderr=True)
@@ -38,6 +39,7 @@ def retrieve(
     Exits with 0 when done, 1 on an error, 130 when stopped; then nothing was written.
     """
     options, queries = query.options, photos.read().photos
+    check_pair_names(output, [each.name for each in queries])
     check_can_be_written([output])
     with connection.client() as client:
         info = client.map(map_ref)

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clients.evaluation.queries import Query
+from clients.evaluation.sent_matches import PhotoMatches
 from clients.wire.features import Features
 from clients.wire.requests import read_image
 from visloc.errors import refuse
@@ -33,6 +35,8 @@ class FeatureReader:
         kind: the map's name for the local features.
         global_features: by the map's names for them.
         origin: where the keypoints' pixel coordinates start counting.
+        matches: with mapping photos, whose features are in the same place; None to let the server
+            match.
     """
 
     kind: str
@@ -40,6 +44,7 @@ class FeatureReader:
     descriptors: FeatureSet
     global_features: dict[str, FeatureSet]
     origin: PixelOrigin
+    matches: PhotoMatches | None = None
 
     def __call__(self, query: Query) -> Features:
         """Read the features of one photo.
@@ -68,7 +73,11 @@ class FeatureReader:
                 name: features.read(query.name)[0].astype(np.float32)
                 for name, features in self.global_features.items()
             },
+            {} if self.matches is None else self.matches.of(query.name, self._keypoints),
         )
+
+    def _keypoints(self, name: str) -> NDArray[np.float32]:
+        return read_local(self.keypoints, self.descriptors, name, None, self.origin)[0]
 
 
 def takes_features(info: MapInfo) -> bool:
@@ -78,7 +87,11 @@ def takes_features(info: MapInfo) -> bool:
 
 
 def choose_reader(
-    source: Path, info: MapInfo, features_dir: Path | None, origin: PixelOrigin
+    source: Path,
+    info: MapInfo,
+    features_dir: Path | None,
+    origin: PixelOrigin,
+    matches: PhotoMatches | None = None,
 ) -> Reader:
     """Return the reader of what a map takes.
 
@@ -89,10 +102,13 @@ def choose_reader(
 
     Raises:
         InvalidInput: ``queries.no_features`` for a list of photos and a map that takes features;
-            ``queries.features_dir`` for a map that takes photos.
+            ``queries.features_dir`` for a map that takes photos; ``queries.matches_dir`` for
+            matches and a map whose local features are not ready-made.
         DatasetError: ``kapture.*`` when the dataset has no such features.
     """
     ready_made = [name for name in info.global_features if name.startswith(READY_MADE_PREFIX)]
+    if matches is not None and not info.local_features.startswith(READY_MADE_PREFIX):
+        raise refuse("queries.matches_dir", field="--matches-dir", got=info.local_features)
     if not takes_features(info):
         if features_dir is not None:
             raise refuse(
@@ -120,4 +136,4 @@ def choose_reader(
         )
         for name in ready_made
     }
-    return FeatureReader(kind, keypoints, descriptors, global_features, origin)
+    return FeatureReader(kind, keypoints, descriptors, global_features, origin, matches)

@@ -24,8 +24,9 @@ class Features(QueryFeatures):
     features, ``localvlad``, may be left out.
 
     Raises:
-        InvalidInput: ``features.keypoints``, ``features.descriptors`` or
-            ``features.global_descriptors`` for a wrong shape, ``features.dtype``.
+        InvalidInput: ``features.keypoints``, ``features.descriptors``,
+            ``features.global_descriptors`` or ``features.matches`` for a wrong shape,
+            ``features.dtype``.
     """
 
     def __post_init__(self) -> None:
@@ -45,6 +46,11 @@ class Features(QueryFeatures):
         object.__setattr__(self, "keypoints", keypoints)
         object.__setattr__(self, "descriptors", descriptors)
         object.__setattr__(self, "global_descriptors", rows)
+        matches = {name: _array("matches", each, name) for name, each in self.matches.items()}
+        for name, each in matches.items():
+            if each.ndim != 2 or each.shape[1] != 3:
+                raise _wrong_shape("matches", "(k, 3): row, x, y", each, name)
+        object.__setattr__(self, "matches", matches)
 
     def as_json(self) -> dict[str, Any]:
         """Return the features as the API has them in JSON, with arrays in base64."""

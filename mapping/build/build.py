@@ -33,7 +33,7 @@ from mapping.cluster.storage import (
 )
 from mapping.cluster.workers import one_thread_here
 from mapping.methods.known_model import landmarks_from_reconstruction
-from mapping.methods.retrieval_only import no_landmarks
+from mapping.methods.retrieval_only import RETRIEVAL_ONLY, no_landmarks
 from mapping.methods.rgbd import landmarks_from_depth
 from mapping.methods.sfm import landmarks_from_matches
 from mapping.own_test.publishing import Examine, write_content
@@ -231,7 +231,7 @@ class _Job:
         metric = settings.poses_are_metric
         if settings.method == "rgbd":
             return (landmarks_from_depth(*inputs, settings.depth, metric=metric),)
-        if settings.method == "retrieval-only":
+        if settings.method == RETRIEVAL_ONLY:
             return (no_landmarks(self.context, photos, metric=metric),)
         if settings.method == "model":
             return (

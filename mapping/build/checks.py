@@ -12,6 +12,7 @@ from mapping.cluster.storage import is_remote, lies_in, work_place
 from mapping.frames.anchor import MAX_DIRECTION_ERROR_DEG, known_positions
 from mapping.methods.adjustment import REFINABLE
 from mapping.methods.known_model import refuse_without_points
+from mapping.methods.retrieval_only import RETRIEVAL_ONLY
 from mapping.methods.rgbd import refuse_without_depth
 from mapping.methods.scenes import find_pairs, make_scene
 from mapping.methods.sfm_settings import POSES
@@ -45,7 +46,7 @@ def check_settings(settings: BuildSettings) -> None:
     _check_global_features(settings)
     _check_lengths(settings)
     _check_sfm(settings)
-    if settings.keep_colours and settings.method == "retrieval-only":
+    if settings.keep_colours and settings.method == RETRIEVAL_ONLY:
         raise refuse("build.keep_colours", field="--keep-colours")
 
 

@@ -23,6 +23,7 @@ from visloc.archive import (
     MapContent,
     pose_row,
 )
+from visloc.archive.gnss import Fixes, GnssFix
 from visloc.kapture import Dataset
 
 # Where the world's axes point east, north and up.
@@ -100,8 +101,27 @@ def photo_content(
         ),
         "image_poses": np.array([pose_row(view.cam_from_world) for view in made.views]),
         "landmarks": made.landmarks,
+        "fixes": _fixes(dataset),
         "descriptors": descriptors,
     }
+
+
+def _fixes(dataset: Dataset) -> Fixes | None:
+    """Return the GNSS fixes of a dataset, all of them, also where no photo was taken."""
+    if not dataset.gnss:
+        return None
+    receivers = dict.fromkeys(record.sensor_id for record in dataset.gnss)
+    return Fixes(
+        receivers={name: dataset.sensors[name].params for name in receivers},
+        fixes=tuple(
+            GnssFix(
+                timestamp=record.timestamp,
+                receiver=record.sensor_id,
+                **{name: getattr(record, name) for name in ("x", "y", "z", "utc", "dop")},
+            )
+            for record in dataset.gnss
+        ),
+    )
 
 
 def _gravity(given: Vector | None, anchor: Anchor) -> tuple[Vector | None, tuple[str, ...]]:

@@ -12,6 +12,7 @@ import typer
 
 from mapping.cluster.executors import EXECUTORS
 from mapping.cluster.storage import place_of
+from mapping.methods.retrieval_only import RETRIEVAL_ONLY
 from mapping.methods.rgbd import DepthSettings
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.options import (
@@ -43,7 +44,7 @@ from visloc.retrieval.index import MAX_EXACT, IndexKind
 
 _cluster_option = partial(typer.Option, rich_help_panel=CLUSTER_PANEL)
 
-METHODS = ("rgbd", "sfm", "model", "retrieval-only")
+METHODS = ("rgbd", "sfm", "model", RETRIEVAL_ONLY)
 
 
 def _weights_in(text: str) -> Mapping[str, float]:

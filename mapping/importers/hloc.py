@@ -128,6 +128,8 @@ def _groups(file: Path) -> Iterator[tuple[str, Any]]:
     """Return the groups that hold arrays, by name. Links to other files are not followed."""
     import h5py
 
+    if not file.is_file():  # HDF5 waits for ever on a pipe
+        raise refuse("hloc.unreadable", field=str(file), got="no file")
     with _errors_of(file), h5py.File(file, "r") as opened:
         names: list[str] = []
 

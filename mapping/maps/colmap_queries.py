@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mapping.maps.colmap_database import DatabasePhoto
 from visloc.archive import Map
 from visloc.images import read_photo_file
-from visloc.kapture import Dataset
+from visloc.kapture import Dataset, FileRecord
 from visloc.localization.localizer import Localizer
 from visloc.localization.solving import Look
 from visloc.options import LocalizeOptions
@@ -30,8 +30,7 @@ def match_queries(
     Args:
         opened: the map.
         localizer: of the map.
-        queries: their poses are not used. A photo without a file, or of the name of a mapping
-            photo, is left out.
+        queries: their poses are not used; of ``usable_queries``, the others are left out.
 
     Returns:
         The photos; their matches, where the rows of the map's photos come before those of the
@@ -40,11 +39,8 @@ def match_queries(
     photos: list[DatabasePhoto] = []
     matches: PairMatches = {}
     names = {image.name: row for row, image in enumerate(opened.images)}
-    left_out = []
-    for record in queries.images:
-        if record.path in names or not queries.has_file(record):
-            left_out.append(record.path)
-            continue
+    usable = usable_queries(opened, queries)
+    for record in usable:
         photo = read_photo_file(queries.path_of(record))
         camera = queries.sensors[record.sensor_id].camera
         look = localizer.look(photo, camera, LocalizeOptions())
@@ -57,9 +53,17 @@ def match_queries(
         photos.append(
             DatabasePhoto(record.path, sensor, look.evidence.camera, keypoints, None, None)
         )
-    if not left_out:
-        return photos, matches, ()
-    return photos, matches, (f"{len(left_out)} queries left out, such as {left_out[0]}",)
+    left_out = len(queries.images) - len(usable)
+    why = "that have no file, or the name of a mapping photo"
+    return photos, matches, (f"{left_out} queries left out {why}",) if left_out else ()
+
+
+def usable_queries(opened: Map, queries: Dataset) -> list[FileRecord]:
+    """Return the photos that can be added: with a file, and without the name of a mapping photo."""
+    names = {image.name for image in opened.images}
+    return [
+        record for record in queries.images if record.path not in names and queries.has_file(record)
+    ]
 
 
 def _with_photos(

@@ -19,6 +19,7 @@ from visloc.archive import (
 )
 from visloc.archive.checks import read_record
 from visloc.archive.content import PoseRow
+from visloc.archive.gnss import read_fixes
 from visloc.archive.npz import read_npz
 from visloc.archive.schema import CamerasFile
 from visloc.errors import refuse
@@ -84,6 +85,7 @@ def content_of(opened: Map) -> MapContent:
         descriptor_scale=scale,
         own_test=manifest.parts.own_test,
         index=IndexKind.IVF if opened.has_index else IndexKind.AUTO,
+        fixes=read_fixes(opened),
     )
 
 
@@ -201,9 +203,11 @@ def joined(a: MapContent, b: MapContent, same: NDArray[np.int64] | None = None) 
 
     Raises:
         Conflict: ``merge.photos`` when both have photos of one name, ``merge.features`` when
-            their local features differ.
+            their local features differ, ``merge.landmarks`` when one alone has landmarks.
     """
     refuse_other_features(a, b)
+    if bool(len(a.landmarks.points)) != bool(len(b.landmarks.points)):
+        raise refuse("merge.landmarks", field="MAP")
     names = {image.name for image in a.images}
     both = [image.name for image in b.images if image.name in names]
     if both:
@@ -223,6 +227,7 @@ def joined(a: MapContent, b: MapContent, same: NDArray[np.int64] | None = None) 
         image_poses=np.concatenate([a.image_poses, b.image_poses]),
         landmarks=_joined_landmarks(a.landmarks, b.landmarks, same),
         max_keypoints=max(a.max_keypoints, b.max_keypoints),
+        fixes=a.fixes.joined(b.fixes) if a.fixes and b.fixes else a.fixes or b.fixes,
         descriptors=lambda: _chained(a, b),
         global_features=tuple(
             _joined_rows(one, other)
@@ -267,8 +272,11 @@ def _joined_landmarks(a: Landmarks, b: Landmarks, same: NDArray[np.int64] | None
     known = np.full(len(b.points), -1) if same is None else same
     new = known < 0
     row_of = np.where(new, count + np.cumsum(new) - 1, known)
-    observed = row_of[b.observed]
-    again = np.bincount(observed[observed < count], minlength=count)
+    if len(b.points):
+        observed = row_of[b.observed]
+        again = np.bincount(observed[observed < count], minlength=count)
+    else:  # without landmarks, observations name themselves
+        observed, again = len(a.observed) + b.observed.astype(np.int64), np.zeros(count, np.int64)
     lengths = np.minimum(a.track_lengths + again, 65535).astype(np.uint16)
     points = (b.points[new] + (b.origin - a.origin)).astype(np.float32)
     # Colours of some landmarks alone are none of the map.

@@ -17,18 +17,20 @@ from mapping.maps.colmap_database import (
     matches_of_tracks,
     write_colmap_database,
 )
-from mapping.maps.colmap_queries import match_queries
+from mapping.maps.colmap_queries import match_queries, usable_queries
 from mapping.methods.retrieval_only import refuse_without_landmarks
 from mapping.stages.imported_points import ImportedPoints, read_imported_points
 from mapping.stages.landmarks import Observations, View, reprojection_errors
 from mapping.stages.outputs import complete_output
 from visloc.archive import ImageRecord, Map
+from visloc.archive.gnss import read_fixes
 from visloc.errors import refuse
 from visloc.geometry import Pose
 from visloc.kapture import (
     READY_MADE_PREFIX,
     Dataset,
     FileRecord,
+    GnssRecord,
     Reconstruction,
     Sensor,
     write_dataset,
@@ -81,7 +83,8 @@ def export_map(
 
     Raises:
         InvalidInput: ``export.unknown_format``; ``export.queries`` for another format, or for a map
-            of an imported reconstruction whose points are not those that queries are matched with.
+            of an imported reconstruction whose points are not those that queries are matched with;
+            ``export.no_queries`` when no photo can be added.
         Conflict: ``export.exists``; ``map.no_landmarks``.
         DatasetError: ``kapture.field`` for a name that kapture cannot hold.
     """
@@ -92,6 +95,8 @@ def export_map(
         format_name != "colmap" or read_imported_points(opened) is not None
     ):
         raise refuse("export.queries", field="--queries", got=f"{format_name} of {opened.ref}")
+    if queries is not None and not usable_queries(opened, queries.dataset):
+        raise refuse("export.no_queries", field="--queries", got=str(queries.dataset.root))
     refuse_without_landmarks(opened)
     with complete_output(output, "export.exists") as partial:
         notes = export(opened, partial)
@@ -222,11 +227,13 @@ def _export_kapture(opened: Map, output: Path) -> tuple[str, ...]:
         FileRecord(timestamp, image.camera, image.name)
         for timestamp, image in zip(timestamps, opened.images, strict=True)
     ]
+    receivers, fixes = _fixes(opened)
     write_dataset(
         Dataset(
             root=output,
             sensors={
-                name: Sensor.with_camera(name, camera) for name, camera in opened.cameras.items()
+                **{name: Sensor.with_camera(name, cam) for name, cam in opened.cameras.items()},
+                **receivers,
             },
             rigs=opened.rigs,
             trajectories={
@@ -235,7 +242,7 @@ def _export_kapture(opened: Map, output: Path) -> tuple[str, ...]:
             },
             images=tuple(sorted(records, key=lambda r: (r.timestamp, r.sensor_id, r.path))),
             depth_maps=(),
-            gnss=(),
+            gnss=fixes,
         )
     )
     local = opened.manifest.local_features.fingerprint.name.removeprefix(READY_MADE_PREFIX)
@@ -271,6 +278,23 @@ def _export_kapture(opened: Map, output: Path) -> tuple[str, ...]:
         f"{later} of {len(timestamps)} photos have a later timestamp than in the map, which has "
         "several of one camera at one time",
     )
+
+
+def _fixes(opened: Map) -> tuple[dict[str, Sensor], tuple[GnssRecord, ...]]:
+    """Return the GNSS receivers of a map and their fixes, as kapture has them."""
+    kept = read_fixes(opened)
+    if kept is None:
+        return {}, ()
+    taken = {name: f"gnss {name}" if name in opened.cameras else name for name in kept.receivers}
+    receivers = {
+        taken[name]: Sensor(taken[name], "", "gnss", params, None)
+        for name, params in kept.receivers.items()
+    }
+    records = (
+        GnssRecord(fix.timestamp, taken[fix.receiver], fix.x, fix.y, fix.z, fix.utc, fix.dop)
+        for fix in kept.fixes
+    )
+    return receivers, tuple(sorted(records, key=lambda each: (each.timestamp, each.sensor_id)))
 
 
 def _timestamps(images: Sequence[ImageRecord]) -> list[int]:

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from mapping.maps.coarse_model import learn
 from mapping.maps.editing import moved_anchor
 from mapping.maps.mistaken import mistaken_for
-from mapping.methods.retrieval_only import refuse_without_landmarks
 from mapping.own_test.verdict import misses_own_photos
 from mapping.progress import one_step
 from mapping.stages.publishing import new_version
@@ -209,7 +208,6 @@ def _described(
 
 
 def _placed(opened: Map, set_from_tile: Similarity) -> _Placed:
-    refuse_without_landmarks(opened)
     manifest, geometry = opened.manifest, MapGeometry(opened)
     centers = set_from_tile.apply(geometry.centers + geometry.origin)
     boxes = [_box(centers)]

@@ -15,6 +15,8 @@ from mapping.stages.photos import MappingPhoto
 from visloc.archive import Anchor, Map
 from visloc.errors import refuse
 
+RETRIEVAL_ONLY = "retrieval-only"
+
 
 def no_landmarks(
     context: BuildContext, photos: Sequence[MappingPhoto], *, metric: bool

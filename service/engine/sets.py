@@ -25,7 +25,7 @@ from service.values import ImageJob, Localization, MapFolder, Query, Rig, RigJob
 from service.workers.judging import agree, judged, without_coarse
 from service.workers.pool import Workers
 from visloc.archive import SetOutline, TileRecord
-from visloc.archive.places import anchor_rms
+from visloc.archive.places import anchor_rms, located
 from visloc.errors import (
     Conflict,
     InvalidInput,
@@ -312,6 +312,7 @@ def in_set(found: Localization, outline: SetOutline, tile: TileRecord) -> Locali
 
 def priors_in(outline: SetOutline, tile: TileRecord, priors: Priors) -> Priors:
     """Move priors from the set's frame to a tile's."""
+    priors = located(priors, outline.manifest.world)
     return priors_in_tile(priors, tile.set_from_tile.similarity, outline.gravity)
 
 

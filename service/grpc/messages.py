@@ -25,6 +25,7 @@ _OPTIONAL_LISTS = {
     "visloc.v1.SequenceStart.maps",
     "visloc.v1.LocalizeOptions.fusion_weights",
     "visloc.v1.LocalizeOptions.photos",
+    "visloc.v1.Features.matches",
     "visloc.v1.Priors.maps",
     "visloc.v1.GravityPrior.world",
     "visloc.v1.Odometry.covariance",

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import JsonValue
 
+from visloc.archive.gnss import Fixes
 from visloc.archive.schema import Anchor, FingerprintRecord, ImageRecord, OwnTest, Vector
 from visloc.geometry import Camera, Pose
 from visloc.retrieval.fusion import EQUAL_GHARM, LateFusion
@@ -79,6 +80,7 @@ class MapContent:
             were read from stores them unchanged; None chooses one that fits the largest value.
         own_test: of a map that this is or is a part of; None when it took none.
         index: whether an inverted file of the global descriptors is written.
+        fixes: of GNSS receivers during the captures.
     """
 
     metric: bool
@@ -102,6 +104,7 @@ class MapContent:
     descriptor_scale: float | None = None
     own_test: OwnTest | None = None
     index: IndexKind = IndexKind.AUTO
+    fixes: Fixes | None = None
 
 
 def pose_row(pose: Pose) -> PoseRow:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from visloc.archive.schema import Geodetic, World
 from visloc.archive.set_schema import SetWorld
+from visloc.errors import refuse
 from visloc.geodesy import (
     ecef_from_geodetic,
     enu_from_ecef,
@@ -17,6 +19,7 @@ from visloc.geodesy import (
     ground_distance,
 )
 from visloc.geometry import Pose, Similarity
+from visloc.priors import Priors
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +63,34 @@ def similarity_on_earth(a: Geodetic, b: Geodetic) -> Similarity:
 def _enu_from_world(geodetic: Geodetic) -> Similarity:
     pose = Pose.from_quaternion(geodetic.rotation_wxyz, geodetic.translation)
     return Similarity(geodetic.scale, pose.rotation, pose.translation)
+
+
+def located(priors: Priors, world: World | SetWorld) -> Priors:
+    """Tell the GNSS prior where the world lies on Earth, unless somebody did.
+
+    How well the map knows that (``Anchor.rms``) adds to the accuracy of the fix.
+
+    Raises:
+        InvalidInput: ``priors.gnss`` when the world's place on Earth is unknown.
+    """
+    fix = priors.gnss
+    if fix is None or fix.fix_from_world is not None:
+        return priors
+    geodetic = None if world.anchor is None else world.anchor.geodetic
+    if geodetic is None:
+        raise refuse("priors.gnss", field="priors.gnss")
+    there = Geodetic(
+        latitude_deg=fix.latitude, longitude_deg=fix.longitude, altitude_m=fix.altitude or 0.0
+    )
+    known = geodetic.scale * anchor_rms(world)
+    vertical = fix.vertical_accuracy
+    fix = replace(
+        fix,
+        accuracy=math.hypot(fix.accuracy, known),
+        vertical_accuracy=None if vertical is None else math.hypot(vertical, known),
+        fix_from_world=similarity_on_earth(there, geodetic),
+    )
+    return replace(priors, gnss=fix)
 
 
 def down_of(geodetic: Geodetic) -> NDArray[np.float64]:

@@ -23,7 +23,7 @@ from visloc.geometry import Pose, Similarity
 from visloc.priors import MAX_TILES
 
 SET_FORMAT = "visloc-set"
-SET_MAJOR, SET_MINOR = 2, 0
+SET_MAJOR, SET_MINOR = 2, 1
 # Scale of a tile. Beyond these, squares and inverses overflow.
 MIN_SCALE, MAX_SCALE = 1e-9, 1e9
 
@@ -73,7 +73,7 @@ class TileRecord(Record):
     photo_extent: Extent
     reach: Annotated[float, Field(ge=0)]
     images: Annotated[int, Field(ge=1)]
-    landmarks: Annotated[int, Field(ge=1)]
+    landmarks: Annotated[int, Field(ge=0)]
     size_bytes: Annotated[int, Field(ge=0)]
     mistaken_for: Annotated[tuple[str, ...], Field(max_length=MAX_TILES)] = ()
     misses_own_photos: bool = False
@@ -110,7 +110,7 @@ class SetCounts(Record):
 
     tiles: Annotated[int, Field(ge=1, le=MAX_TILES)]
     images: Annotated[int, Field(ge=1)]
-    landmarks: Annotated[int, Field(ge=1)]
+    landmarks: Annotated[int, Field(ge=0)]
 
 
 class SetManifest(Record):

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from visloc.archive.content import GlobalFeatures, Landmarks, MapContent
 from visloc.archive.files import BLOCK_ROWS, Files, blocks_of
+from visloc.archive.gnss import GNSS_FILE
 from visloc.archive.index_files import index_files
 from visloc.archive.schema import (
     FORMAT,
@@ -49,6 +50,8 @@ def write_map(folder: Path, content: MapContent, *, map_id: str, version: str, c
     """
     files, landmarks = Files(folder), content.landmarks
     _write_images(files, content)
+    if content.fixes is not None:
+        files.write_json(GNSS_FILE, content.fixes.model_dump())
     _write_landmarks(files, landmarks)
     keypoint_step = _write_keypoints(files, landmarks.keypoints, content.cameras)
     scale = _write_descriptors(

@@ -47,6 +47,17 @@ def read_pair_rows(path: Path) -> Iterator[PairRow]:
         yield PairRow(parts[0], parts[1], score, table)
 
 
+def check_pair_names(path: Path, names: Iterable[str]) -> None:
+    """Refuse names of photos that a pairs file cannot hold.
+
+    Raises:
+        DatasetError: ``kapture.field`` for a name with a comma, or that would not be read as it is.
+    """
+    for name in names:
+        if not is_field(name):
+            raise refuse("kapture.field", field=str(path), got=name)
+
+
 def write_pair_rows(path: Path, rows: Iterable[tuple[str, str, float]]) -> None:
     """Write pairs as kapture has them, scores exactly; a file there is replaced.
 
@@ -55,9 +66,7 @@ def write_pair_rows(path: Path, rows: Iterable[tuple[str, str, float]]) -> None:
     """
     lines = [_HEADER]
     for first, second, score in rows:
-        for name in (first, second):
-            if not is_field(name):
-                raise refuse("kapture.field", field=str(path), got=name)
+        check_pair_names(path, (first, second))
         lines.append(f"{first}, {second}, {score!r}")
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, ("\n".join(lines) + "\n").encode("utf-8"))

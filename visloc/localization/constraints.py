@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from visloc.archive import Manifest, Map
+from visloc.archive.places import located
 from visloc.errors import refuse
 from visloc.features.resolution import Resolution, WorkingResolution
 from visloc.geometry import Pose
@@ -28,7 +29,7 @@ from visloc.pose.generalized import MAX_FOCAL, MIN_FOCAL
 from visloc.pose.gravity import KnownGravity, gravity_deviation
 from visloc.pose.map_errors import PHOTO_ONLY, MapErrors
 from visloc.pose.views import MatchedView
-from visloc.priors import HEIGHT_REACH, POSE_PRIOR_STDS, REACH, Priors
+from visloc.priors import HEIGHT_REACH, POSE_PRIOR_STDS, REACH, GnssPrior, Priors
 
 _LEAST_REACH = 1e-9  # of a map whose photos see nothing
 # A pose contradicts a prior beyond this many of its own standard deviations.
@@ -172,11 +173,14 @@ class Constraints:
 
     Raises:
         InvalidInput: ``priors.gravity`` or ``priors.height`` when neither the map nor the request
-            knows which way is down in the world.
+            knows which way is down in the world; ``priors.gnss`` when the map does not know where
+            it lies on Earth.
     """
 
     def __init__(self, geometry: MapGeometry, priors: Priors) -> None:
         self.geometry = geometry
+        if priors.gnss is not None:
+            priors = located(priors, geometry.opened.manifest.world)
         self._priors = priors
         gravity = priors.gravity
         down = geometry.down
@@ -221,7 +225,7 @@ class Constraints:
     def narrow(self) -> bool:
         """Whether the priors exclude photos or poses from the search."""
         priors = self._priors
-        return any((priors.position, priors.height, priors.pose, priors.gravity))
+        return any((priors.position, priors.height, priors.pose, priors.gravity, priors.gnss))
 
     @cached_property
     def photo_weights(self) -> NDArray[np.float64] | None:
@@ -232,14 +236,17 @@ class Constraints:
             spheres.append((prior.position - self.geometry.origin, prior.radius))
         if self._pose is not None:
             spheres.append((self._pose[0].center, POSE_PRIOR_STDS * largest_std(*self._pose)))
-        if not spheres and self._priors.height is None:
+        if not spheres and self._priors.height is None and self._priors.gnss is None:
             return None
         centers = self.geometry.centers
         weights = np.ones(len(centers))
         reach = max(self.geometry.reach, _LEAST_REACH)
         for center, radius in spheres:
             beyond = (np.linalg.norm(centers - center, axis=1) - radius) / reach
-            weights *= np.where(beyond <= REACH, np.exp(-0.5 * np.maximum(beyond, 0.0) ** 2), 0.0)
+            weights *= _weight(beyond)
+        fix = self._priors.gnss
+        if fix is not None:
+            weights *= _weight(fix.beyond(centers + self.geometry.origin) / (_metres(fix) * reach))
         band = self._priors.height
         if band is not None and self._up is not None:
             slack = HEIGHT_REACH * (band.max - band.min)
@@ -264,6 +271,11 @@ class Constraints:
                     f"it lies {away:.2f} from the prior position, but at most "
                     f"{position.radius:g} is allowed"
                 )
+        fix = self._priors.gnss
+        if fix is not None:
+            beyond = float(fix.beyond(center[None])[0]) / _metres(fix)
+            if beyond > own:
+                return f"it lies {beyond:.2f} outside what the GNSS prior allows"
         band = self._priors.height
         if band is not None and self._up is not None:
             height = float(center @ self._up)
@@ -322,6 +334,17 @@ class Constraints:
             near = angle <= turn + slack + np.arctan2(move, depth)
             kept.append(replace(view, pixels=view.pixels[near], points=view.points[near]))
         return kept
+
+
+def _weight(beyond: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how much photos (n,) count that lie so far outside an area, in viewing distances."""
+    return np.where(beyond <= REACH, np.exp(-0.5 * np.maximum(beyond, 0.0) ** 2), 0.0)
+
+
+def _metres(fix: GnssPrior) -> float:
+    """Return the metres in a unit of the world."""
+    assert fix.fix_from_world is not None  # by ``located``
+    return fix.fix_from_world.scale
 
 
 def _nearest_rays(view: MatchedView, expected: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -37,6 +37,7 @@ from visloc.localization.query_features import (
 )
 from visloc.localization.rematching import Rematching, seen_as_found
 from visloc.localization.rivals import Proposed
+from visloc.localization.sent_matches import SentMatches, sent_matches
 from visloc.localization.solving import (
     Look,
     Matches,
@@ -89,6 +90,7 @@ class _Features:
         rgb: (height, width, 3) pixels for descriptors that look at them.
         seconds: of ``evidence``, to be added to.
         reduced: how many stored pixels each side of a pixel of the keypoints spans.
+        matches: that were sent; None to match here.
     """
 
     local: LocalFeatures
@@ -97,6 +99,7 @@ class _Features:
     evidence: Evidence
     seconds: dict[str, float]
     reduced: float
+    matches: SentMatches | None = None
 
 
 class Localizer:
@@ -303,7 +306,9 @@ class Localizer:
             sent = checked_global_descriptors(features, self.map.manifest, optional)
         seen = query_resolution(camera, CameraSource.GIVEN)
         reduced = self.geometry.resolution.finer(seen)
-        found = _Features(local.reduced(reduced), sent, _NO_PIXELS, evidence, seconds, reduced)
+        matches = sent_matches(features, local)
+        local = local.reduced(reduced)
+        found = _Features(local, sent, _NO_PIXELS, evidence, seconds, reduced, matches)
         return self._match(found, options, fusion, constraints)
 
     def solve(
@@ -383,8 +388,9 @@ class Localizer:
         with timed(seconds, "matching"):
             shown = Shown(local.keypoints, round_descriptors(local.descriptors))
             ratio = CLEAR_RATIO if options.matcher is Matcher.RATIO else None
-            pairs = self._match_photos(shown, retrieved.images, ratio, rematching)
-            others = self._match_photos(shown, elsewhere, ratio, rematching)
+            sent = features.matches
+            pairs = self._match_photos(shown, retrieved.images, ratio, sent or rematching)
+            others = self._match_photos(shown, elsewhere, ratio, sent or rematching)
         matched, points = pairs.settled(), self.geometry.points(pairs.landmarks)
         matches = self._matches(shown, matched)
         evidence = replace(evidence, num_correspondences=len(matches.pixels))
@@ -404,9 +410,11 @@ class Localizer:
         shown: Shown,
         photos: NDArray[np.int64],
         ratio: float | None,
-        rematching: Rematching | None,
+        rematching: SentMatches | Rematching | None,
     ) -> Proposals:
         """Match with the landmarks that these photos see, best photo first."""
+        if isinstance(rematching, SentMatches):
+            return rematching.propose(self.geometry, photos.tolist())
         return propose_landmarks(
             shown.descriptors,
             (self.geometry.observed(photo) for photo in photos),

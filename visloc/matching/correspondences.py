@@ -242,6 +242,13 @@ def propose_landmarks(
         best = sorted(range(len(found)), key=lambda photo: -len(found[photo][0]))[:NUM_REMATCHED]
         for photo, better in zip(best, in_threads(rematch, best), strict=True):
             found[photo] = better
+    return proposals_of(found)
+
+
+def proposals_of(found: Sequence[Pairs]) -> Proposals:
+    """Join what mapping photos propose, best photo first: keypoints, landmarks, similarities."""
+    if not found:
+        return Proposals.none()
     keypoints, landmarks, similarities = map(np.concatenate, zip(*found, strict=True))
     ranks = np.repeat(np.arange(len(found)), [len(i) for i, _, _ in found])
     return Proposals(keypoints, landmarks, ranks, similarities)

@@ -16,6 +16,10 @@ from visloc.types import CoarseMethod
 # Of the cosine in CSI; the paper's and kapture-localization's default.
 CSI_POWER = 8.0
 
+# Bound on the weights of BDI: a pose may lie so many times as far from the mean of the photos as
+# they lie apart.
+MOST_EXTRAPOLATED = 10.0
+
 # Takes unit rows: the query (D,) and retrieved photos (k, D). Returns (k,) of sum 1.
 Weighting = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 
@@ -30,13 +34,17 @@ def barycentric(query: NDArray[np.float64], photos: NDArray[np.float64]) -> NDAr
     """BDI, barycentric descriptor interpolation: ``argmin |q - sum(w_i d_i)|`` with sum 1.
 
     Weights may be negative. Where several are as good, as of photos that are the same, these are
-    the ones nearest to equal weights.
+    the ones nearest to equal weights. Photos that are almost the same would get huge weights of
+    both signs, which say nothing and carry the pose far away: weights are drawn towards equal ones
+    until their distances from these sum to ``MOST_EXTRAPOLATED`` at most.
     """
     equal = equal_weighted(query, photos)
     # Differences from equal weights that keep the sum: orthogonal to (1, ..., 1).
     centred = photos - photos.mean(axis=0)
     rest = np.linalg.lstsq(centred.T, query - equal @ photos, rcond=1e-9)[0]
-    return np.asarray(equal + rest - rest.mean())
+    rest -= rest.mean()
+    far = float(np.abs(rest).sum())
+    return np.asarray(equal + rest * min(1.0, MOST_EXTRAPOLATED / max(far, MOST_EXTRAPOLATED)))
 
 
 def cosine_similarity(

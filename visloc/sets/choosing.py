@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.archive import SetOutline
-from visloc.archive.places import circles_of
+from visloc.archive.places import circles_of, located
 from visloc.errors import refuse
 from visloc.geodesy import ground_distances
 from visloc.localization.judge import measured_pose
@@ -75,7 +75,8 @@ def allowed_tiles(
 
     Raises:
         InvalidInput: ``priors.maps`` for a name that is no tile; ``priors.height`` when neither the
-            set nor the priors define which way is down.
+            set nor the priors define which way is down; ``priors.gnss`` when the set does not know
+            where it lies on Earth.
         NotFound: ``set.no_tile``.
     """
     low, high = outline.photo_boxes[:, 0], outline.photo_boxes[:, 1]
@@ -91,6 +92,12 @@ def allowed_tiles(
     for center, radius in spheres:
         away = np.linalg.norm(center - np.clip(center, low, high), axis=1)
         allowed &= away <= radius + REACH * outline.reaches
+    fix = located(priors, outline.manifest.world).gnss
+    if fix is not None and fix.fix_from_world is not None:
+        # A box may lie aslant of the vertical: the sphere around it is compared.
+        radii = np.linalg.norm(high - low, axis=1) / 2
+        beyond = fix.beyond((low + high) / 2) / fix.fix_from_world.scale
+        allowed &= beyond <= radii + REACH * outline.reaches
     band, down = priors.height, down_in_set(priors, outline.gravity)
     if band is not None and down is not None:
         middle = -((low + high) / 2) @ down
@@ -124,9 +131,12 @@ def nearest_tile(
         center = priors.position.position
     elif priors.pose is not None:
         center = priors.pose.device_from_world.center
+    low, high = outline.photo_boxes[:, 0], outline.photo_boxes[:, 1]
+    fix = located(priors, outline.manifest.world).gnss
+    if center is None and fix is not None:
+        return int(np.where(asked, fix.beyond((low + high) / 2), np.inf).argmin())
     if center is None:
         return int(np.flatnonzero(asked)[0])
-    low, high = outline.photo_boxes[:, 0], outline.photo_boxes[:, 1]
     away = np.linalg.norm(center - np.clip(center, low, high), axis=1)
     return int(np.where(asked, away, np.inf).argmin())
 

@@ -74,7 +74,7 @@ def priors_in_tile(
     """Move priors from the set's frame to a tile's; without ``maps``, which chose the tile.
 
     Args:
-        priors: in the set's frame.
+        priors: in the set's frame; a GNSS prior is ``located``.
         set_from_tile: transform of the tile.
         down: (3,) the set's own direction; None when unknown.
 
@@ -96,7 +96,11 @@ def priors_in_tile(
         pose = PosePrior(*moved_pose(pose.device_from_world, pose.covariance, tile_from_set))
     if gravity is not None and gravity.world is not None:
         gravity = replace(gravity, world=tile_from_set.rotation @ gravity.world)
-    return Priors(position=position, height=height, pose=pose, gravity=gravity)
+    gnss = priors.gnss
+    if gnss is not None:
+        assert gnss.fix_from_world is not None  # by the set, as the caller saw to
+        gnss = replace(gnss, fix_from_world=gnss.fix_from_world @ set_from_tile)
+    return Priors(position=position, height=height, pose=pose, gravity=gravity, gnss=gnss)
 
 
 def scaled_device(cam_from_rig: Pose, scale: float) -> Pose:

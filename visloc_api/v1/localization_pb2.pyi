@@ -276,10 +276,32 @@ class Features(_message.Message):
         def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
         def WhichOneof(self, oneof_group: _Never) -> None: ...
 
+    @_typing.final
+    class MatchesEntry(_message.Message):
+        DESCRIPTOR: _descriptor.Descriptor
+
+        KEY_FIELD_NUMBER: _builtins.int
+        VALUE_FIELD_NUMBER: _builtins.int
+        key: _builtins.str
+        @_builtins.property
+        def value(self) -> Global___Array: ...
+        def __init__(
+            self,
+            *,
+            key: _builtins.str = ...,
+            value: Global___Array | None = ...,
+        ) -> None: ...
+        _HasFieldArgType: _TypeAlias = _typing.Literal["value", b"value"]  # noqa: Y015
+        def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+        _ClearFieldArgType: _TypeAlias = _typing.Literal["key", b"key", "value", b"value"]  # noqa: Y015
+        def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+        def WhichOneof(self, oneof_group: _Never) -> None: ...
+
     KIND_FIELD_NUMBER: _builtins.int
     KEYPOINTS_FIELD_NUMBER: _builtins.int
     DESCRIPTORS_FIELD_NUMBER: _builtins.int
     GLOBAL_DESCRIPTORS_FIELD_NUMBER: _builtins.int
+    MATCHES_FIELD_NUMBER: _builtins.int
     kind: _builtins.str
     """the map's local_features"""
     @_builtins.property
@@ -296,6 +318,12 @@ class Features(_message.Message):
         features, such as localvlad, may be left out.
         """
 
+    @_builtins.property
+    def matches(self) -> _containers.MessageMap[_builtins.str, Global___Array]:
+        """By the name of a mapping photo, k x 3: the row of a keypoint, and x, y of the photo's keypoint
+        that it is matched with. When there are any, they replace the service's own matching.
+        """
+
     def __init__(
         self,
         *,
@@ -303,10 +331,11 @@ class Features(_message.Message):
         keypoints: Global___Array | None = ...,
         descriptors: Global___Array | None = ...,
         global_descriptors: _abc.Mapping[_builtins.str, Global___Array] | None = ...,
+        matches: _abc.Mapping[_builtins.str, Global___Array] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["descriptors", b"descriptors", "keypoints", b"keypoints"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["descriptors", b"descriptors", "global_descriptors", b"global_descriptors", "keypoints", b"keypoints", "kind", b"kind"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["descriptors", b"descriptors", "global_descriptors", b"global_descriptors", "keypoints", b"keypoints", "kind", b"kind", "matches", b"matches"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -437,6 +466,51 @@ class GravityPrior(_message.Message):
 Global___GravityPrior: _TypeAlias = GravityPrior  # noqa: Y015
 
 @_typing.final
+class GnssPrior(_message.Message):
+    """Where a satellite receiver has the device. Needs a map that knows where it lies on Earth."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    LATITUDE_FIELD_NUMBER: _builtins.int
+    LONGITUDE_FIELD_NUMBER: _builtins.int
+    ACCURACY_FIELD_NUMBER: _builtins.int
+    ALTITUDE_FIELD_NUMBER: _builtins.int
+    VERTICAL_ACCURACY_FIELD_NUMBER: _builtins.int
+    latitude: _builtins.float
+    """degrees, WGS84"""
+    longitude: _builtins.float
+    """degrees"""
+    accuracy: _builtins.float
+    """metres: horizontal radius that holds 68 % of fixes"""
+    altitude: _builtins.float
+    """metres above the ellipsoid; with vertical_accuracy"""
+    vertical_accuracy: _builtins.float
+    """metres"""
+    def __init__(
+        self,
+        *,
+        latitude: _builtins.float = ...,
+        longitude: _builtins.float = ...,
+        accuracy: _builtins.float = ...,
+        altitude: _builtins.float | None = ...,
+        vertical_accuracy: _builtins.float | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_altitude", b"_altitude", "_vertical_accuracy", b"_vertical_accuracy", "altitude", b"altitude", "vertical_accuracy", b"vertical_accuracy"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_altitude", b"_altitude", "_vertical_accuracy", b"_vertical_accuracy", "accuracy", b"accuracy", "altitude", b"altitude", "latitude", b"latitude", "longitude", b"longitude", "vertical_accuracy", b"vertical_accuracy"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__altitude: _TypeAlias = _typing.Literal["altitude"]  # noqa: Y015
+    _WhichOneofArgType__altitude: _TypeAlias = _typing.Literal["_altitude", b"_altitude"]  # noqa: Y015
+    _WhichOneofReturnType__vertical_accuracy: _TypeAlias = _typing.Literal["vertical_accuracy"]  # noqa: Y015
+    _WhichOneofArgType__vertical_accuracy: _TypeAlias = _typing.Literal["_vertical_accuracy", b"_vertical_accuracy"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__altitude) -> _WhichOneofReturnType__altitude | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__vertical_accuracy) -> _WhichOneofReturnType__vertical_accuracy | None: ...
+
+Global___GnssPrior: _TypeAlias = GnssPrior  # noqa: Y015
+
+@_typing.final
 class Priors(_message.Message):
     """What is known before any photo is looked at. A prior narrows the search, and a pose that
     contradicts it is refused; a prior never changes a pose. With several maps the prior is applied in
@@ -449,6 +523,7 @@ class Priors(_message.Message):
     HEIGHT_FIELD_NUMBER: _builtins.int
     POSE_FIELD_NUMBER: _builtins.int
     GRAVITY_FIELD_NUMBER: _builtins.int
+    GNSS_FIELD_NUMBER: _builtins.int
     MAPS_FIELD_NUMBER: _builtins.int
     @_builtins.property
     def position(self) -> Global___PositionPrior: ...
@@ -458,6 +533,8 @@ class Priors(_message.Message):
     def pose(self) -> Global___PosePrior: ...
     @_builtins.property
     def gravity(self) -> Global___GravityPrior: ...
+    @_builtins.property
+    def gnss(self) -> Global___GnssPrior: ...
     @_builtins.property
     def maps(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
         """tiles of the set that the device may be in, id or id@version"""
@@ -469,12 +546,15 @@ class Priors(_message.Message):
         height: Global___HeightBand | None = ...,
         pose: Global___PosePrior | None = ...,
         gravity: Global___GravityPrior | None = ...,
+        gnss: Global___GnssPrior | None = ...,
         maps: _abc.Iterable[_builtins.str] | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_gravity", b"_gravity", "_height", b"_height", "_pose", b"_pose", "_position", b"_position", "gravity", b"gravity", "height", b"height", "pose", b"pose", "position", b"position"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_gnss", b"_gnss", "_gravity", b"_gravity", "_height", b"_height", "_pose", b"_pose", "_position", b"_position", "gnss", b"gnss", "gravity", b"gravity", "height", b"height", "pose", b"pose", "position", b"position"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_gravity", b"_gravity", "_height", b"_height", "_pose", b"_pose", "_position", b"_position", "gravity", b"gravity", "height", b"height", "maps", b"maps", "pose", b"pose", "position", b"position"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_gnss", b"_gnss", "_gravity", b"_gravity", "_height", b"_height", "_pose", b"_pose", "_position", b"_position", "gnss", b"gnss", "gravity", b"gravity", "height", b"height", "maps", b"maps", "pose", b"pose", "position", b"position"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__gnss: _TypeAlias = _typing.Literal["gnss"]  # noqa: Y015
+    _WhichOneofArgType__gnss: _TypeAlias = _typing.Literal["_gnss", b"_gnss"]  # noqa: Y015
     _WhichOneofReturnType__gravity: _TypeAlias = _typing.Literal["gravity"]  # noqa: Y015
     _WhichOneofArgType__gravity: _TypeAlias = _typing.Literal["_gravity", b"_gravity"]  # noqa: Y015
     _WhichOneofReturnType__height: _TypeAlias = _typing.Literal["height"]  # noqa: Y015
@@ -483,6 +563,8 @@ class Priors(_message.Message):
     _WhichOneofArgType__pose: _TypeAlias = _typing.Literal["_pose", b"_pose"]  # noqa: Y015
     _WhichOneofReturnType__position: _TypeAlias = _typing.Literal["position"]  # noqa: Y015
     _WhichOneofArgType__position: _TypeAlias = _typing.Literal["_position", b"_position"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__gnss) -> _WhichOneofReturnType__gnss | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__gravity) -> _WhichOneofReturnType__gravity | None: ...
     @_typing.overload

@@ -14,6 +14,7 @@ from pydantic_core import PydanticCustomError
 
 import visloc.types
 from visloc.errors import refuse
+from visloc.options import MAX_PHOTOS
 from visloc_api.words.base import AS_BASE64
 from visloc_api.words.json_text import bytes_of_base64
 from visloc_api.words.message import IncomingMessage, converted
@@ -116,6 +117,17 @@ def _few(value: object) -> object:
     return value
 
 
+def _not_too_many(value: object) -> object:
+    if isinstance(value, dict) and len(value) > MAX_PHOTOS:
+        raise refuse(
+            "features.matches",
+            field="matches",
+            expected=f"matches with at most {MAX_PHOTOS} mapping photos",
+            got=len(value),
+        )
+    return value
+
+
 class Features(IncomingMessage):
     """What was found in one photo. Descriptors may have any length: the server normalizes them."""
 
@@ -139,6 +151,15 @@ class Features(IncomingMessage):
         ),
     ]
 
+    matches: Annotated[
+        dict[str, Array] | None,
+        converted(_not_too_many),
+        Field(
+            description="by the name of a mapping photo, k x 3: the row of a keypoint, and x, y of "
+            "the photo's keypoint that it is matched with; they replace the service's own matching",
+        ),
+    ] = None
+
     def to_core(self) -> visloc.types.QueryFeatures:
         """Return the features, their arrays checked for what they say of themselves.
 
@@ -153,16 +174,22 @@ class Features(IncomingMessage):
                 name: row.to_core(f"features.global_descriptors.{name[:100]}", 1)
                 for name, row in self.global_descriptors.items()
             },
+            {
+                name: rows.to_core(f"features.matches.{name[:100]}", 2)
+                for name, rows in (self.matches or {}).items()
+            },
         )
 
     @staticmethod
     def from_core(features: visloc.types.QueryFeatures) -> Features:
         rows = features.global_descriptors
+        sent = {name: Array.from_core(each) for name, each in features.matches.items()}
         return Features(
             kind=features.kind,
             keypoints=Array.from_core(features.keypoints),
             descriptors=Array.from_core(features.descriptors),
             global_descriptors={name: Array.from_core(row) for name, row in rows.items()},
+            matches=sent or None,
         )
 
 

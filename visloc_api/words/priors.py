@@ -119,6 +119,42 @@ class GravityPrior(IncomingMessage):
         )
 
 
+class GnssPrior(IncomingMessage):
+    """The device is where a satellite receiver has it, give or take."""
+
+    latitude: Annotated[float, Field(description="degrees, WGS84")]
+    longitude: Annotated[float, Field(description="degrees")]
+    accuracy: Annotated[
+        float,
+        Field(
+            description="horizontal radius that holds 68 % of fixes, as phones state it: metres, "
+            "positive"
+        ),
+    ]
+    altitude: Annotated[
+        float | None, Field(description="metres above the ellipsoid; with vertical_accuracy")
+    ] = None
+    vertical_accuracy: Annotated[
+        float | None, Field(description="of the altitude, metres, positive")
+    ] = None
+
+    def to_core(self) -> visloc.priors.GnssPrior:
+        """Return the prior, checked."""
+        return visloc.priors.GnssPrior(
+            self.latitude, self.longitude, self.accuracy, self.altitude, self.vertical_accuracy
+        )
+
+    @staticmethod
+    def from_core(prior: visloc.priors.GnssPrior) -> GnssPrior:
+        return GnssPrior(
+            latitude=prior.latitude,
+            longitude=prior.longitude,
+            accuracy=prior.accuracy,
+            altitude=prior.altitude,
+            vertical_accuracy=prior.vertical_accuracy,
+        )
+
+
 class Priors(IncomingMessage):
     """What is known of the device. It adjusts no pose; a pose that contradicts it is refused."""
 
@@ -128,6 +164,7 @@ class Priors(IncomingMessage):
     height: HeightBand | None = None
     pose: PosePrior | None = None
     gravity: GravityPrior | None = None
+    gnss: GnssPrior | None = None
     maps: Annotated[
         list[str] | None,
         FailFast(),
@@ -149,6 +186,7 @@ class Priors(IncomingMessage):
             height=None if self.height is None else self.height.to_core(),
             pose=None if self.pose is None else self.pose.to_core(),
             gravity=None if self.gravity is None else self.gravity.to_core(),
+            gnss=None if self.gnss is None else self.gnss.to_core(),
             maps=None if self.maps is None else tuple(self.maps),
         )
 
@@ -167,6 +205,7 @@ class Priors(IncomingMessage):
             height=None if height is None else HeightBand.from_core(height),
             pose=None if pose is None else PosePrior.from_core(pose),
             gravity=None if priors.gravity is None else GravityPrior.from_core(priors.gravity),
+            gnss=None if priors.gnss is None else GnssPrior.from_core(priors.gnss),
             maps=None if priors.maps is None else list(priors.maps),
         )
 

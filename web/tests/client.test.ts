@@ -112,12 +112,12 @@ describe("the form of a photo", () => {
       ...CALL,
       camera: { model: "PINHOLE", width: 640, height: 480, params: [525, 525.5, 320, 240] },
       options: { top_k: 5 },
-      priors: { position: { position: [0, 0, 0] } },
+      priors: { gnss: { latitude: 48.1, longitude: 8.2, accuracy: 4.5 } },
       debug: true,
     });
     expect(form.get("camera")).toBe("PINHOLE,640,480,525,525.5,320,240");
     expect(form.get("options")).toBe('{"top_k":5}');
-    expect(form.get("priors")).toBe('{"position":{"position":[0,0,0]}}');
+    expect(form.get("priors")).toBe('{"gnss":{"latitude":48.1,"longitude":8.2,"accuracy":4.5}}');
     expect(form.get("debug")).toBe("true");
     expect((form.get("image") as File).name).toBe('a "b".jpg');
   });

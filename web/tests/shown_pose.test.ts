@@ -39,3 +39,27 @@ test("a place in the frame of another map is not drawn in this one", () => {
 test("a photo refused for another reason is drawn nowhere", () => {
   expect(shownPlaces(refusedWith())).toEqual([]);
 });
+
+test("a coarse place is drawn with its spread", () => {
+  const covariance = Array.from({ length: 36 }, (_, i) =>
+    i % 7 === 0 ? [1e-9, 4][+(i > 20)]! : 0,
+  );
+  const answer = {
+    ...refusedWith(),
+    status: "coarse",
+    coarse: {
+      cam_from_world: { rotation_wxyz: [1, 0, 0, 0], translation: [-1, -2, -3] },
+      ...{ position: [1, 2, 3], orientation: [1, 0, 0, 0], covariance },
+      ...{ position_std: [2, 2, 2], orientation_std_deg: [1, 1, 1], method: "bdi" },
+    },
+  } as unknown as LocalizeResponse;
+
+  const [place, ...others] = shownPlaces(answer);
+
+  expect(others).toEqual([]);
+  expect(place!.position).toEqual([1, 2, 3]);
+  // A standard deviation of 2 in each direction.
+  [4, 4, 4].forEach((variance, i) => {
+    expect(place!.positionCovariance![4 * i]).toBeCloseTo(variance, 5);
+  });
+});

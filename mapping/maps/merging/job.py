@@ -12,7 +12,6 @@ from mapping.build.pieces import without_pieces
 from mapping.maps.editing import content_of, joined, moved, refuse_other_features, same_model
 from mapping.maps.merging.registration import Registration, register, updates_of
 from mapping.maps.sets import publish_set
-from mapping.methods.retrieval_only import refuse_without_landmarks
 from mapping.own_test.publishing import publish_edited, refuse_not_accepted
 from mapping.report.cameras import origins_record
 from mapping.stages.publishing import photo_files, sole_publisher
@@ -70,7 +69,8 @@ def merge_maps(
 
     Raises:
         Conflict: ``map.doubtful`` for a version in doubt that is not in use; ``merge.overlap``,
-            ``merge.unit``, ``merge.features``, ``merge.photos``; ``map.exists``;
+            ``merge.unit``, ``merge.features``, ``merge.landmarks``, ``merge.photos``;
+            ``map.exists``;
             ``build.running``.
         InvalidInput: ``map.id``, ``merge.same``, ``merge.min_overlap``.
     """
@@ -143,8 +143,6 @@ def _opened(store: MapStore, a_ref: str, b_ref: str, min_overlap: float) -> tupl
     a, b = store.open(a_ref), store.open(b_ref)
     if a.ref == b.ref:
         raise refuse("merge.same", field="MAP", got=a.ref)
-    for opened in (a, b):
-        refuse_without_landmarks(opened)
     return a, b
 
 

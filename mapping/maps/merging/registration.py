@@ -130,7 +130,7 @@ def _seen(
             pose_here=Pose.from_quaternion(row[:4], row[4:]),
             camera=source.cameras[source.images[image].camera],
             pixels=source.keypoints(image)[matched.keypoints][inliers].astype(np.float64),
-            points=target.landmarks[matched.landmarks][inliers] + geometry.origin,
+            points=geometry.points(matched.landmarks[inliers]) + geometry.origin,
             own_points=source.landmarks[own] + source_origin if depth else None,
             pose_there=Pose(local.rotation, local.translation - local.rotation @ geometry.origin),
         )

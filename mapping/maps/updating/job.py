@@ -38,7 +38,7 @@ from mapping.maps.updating.settings import (
     refuse_few,
     refuse_strange_settings,
 )
-from mapping.methods.retrieval_only import refuse_without_landmarks
+from mapping.methods.retrieval_only import no_landmarks
 from mapping.methods.rgbd import (
     DepthSettings,
     landmarks_from_depth,
@@ -125,14 +125,14 @@ def update_map(settings: UpdateSettings, progress: Progress) -> Updated:
     Raises:
         Conflict: ``update.elsewhere`` for a capture that does not fit the map; ``update.photos``
             when the map has photos of these names; ``map.outdated`` when another version is
-            current; ``map.features``; ``update.settings``; ``build.running``.
+            current; ``map.no_landmarks`` for landmarks in a map without any; ``map.features``;
+            ``update.settings``; ``build.running``.
         DatasetError, WeightsError, InvalidInput: with the file or the setting that is wrong.
         Unavailable: ``storage.failed`` when the disk is full or broken.
     """
     check_settings(settings)
     store = MapStore(settings.maps_dir)
     opened = open_map(map_folder(settings.map_ref, settings.maps_dir))
-    refuse_without_landmarks(opened)
     map_id, version = opened.manifest.id, opened.manifest.version
     method = method_for(settings, opened)
     refuse_strange_settings(opened)
@@ -182,7 +182,7 @@ class _Job:
             self.context, settings, self.opened, self.dataset, with_depth=by_depth
         )
         count = len(capture.photos)
-        if not by_depth:
+        if self.method == "sfm":
             refuse_few(count)
         rows = evenly(range(count), count if settings.poses == "localize" else _TIED_BY)
         # A capture of another place is refused before the long work begins.
@@ -310,11 +310,13 @@ class _Job:
         map_from_dataset: Similarity,
     ) -> tuple[MadeLandmarks, NDArray[np.int64] | None]:
         """Return landmarks of the new photos in the map's frame, and the map's rows for them."""
-        if self.method == "sfm":
+        if self.method != "rgbd":
             photos = [
                 replace(photo, cam_from_world=map_from_dataset.move(photo.pose))
                 for photo in capture.photos
             ]
+            if not self.opened.has_landmarks:
+                return no_landmarks(self.context, photos, metric=content.metric), None
             described = [
                 replace(one, descriptors=capture.described[one.fingerprint.name])
                 for one in content.global_features

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from mapping.methods.retrieval_only import RETRIEVAL_ONLY
 from mapping.methods.rgbd import DepthSettings
 from mapping.options import (
     AcceptOption,
@@ -99,11 +100,16 @@ def check_settings(settings: UpdateSettings) -> None:
 
 
 def method_for(settings: UpdateSettings, opened: Map) -> str:
-    """Return the chosen method, or else the map's.
+    """Return the chosen method, or else the map's; a map without landmarks gets none.
 
     Raises:
+        Conflict: ``map.no_landmarks`` for landmarks that are to join a map without any.
         InvalidInput: ``update.unit`` when depth has no unit in the map.
     """
+    if not opened.has_landmarks:
+        if settings.method is not None:
+            raise refuse("map.no_landmarks", field="--method", ref=opened.ref)
+        return RETRIEVAL_ONLY
     made_by = opened.manifest.method.name
     method = settings.method or (made_by if made_by in METHODS else "sfm")
     if method == "rgbd" and settings.poses != "tie" and not opened.manifest.world.metric:

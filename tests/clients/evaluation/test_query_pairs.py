@@ -52,6 +52,21 @@ def test_the_photos_of_a_file_are_sent_in_its_order(
     assert [line["status"] for line in lines] == ["localized", "localized", "error"]
     assert lines[2]["error"]["code"] == "pairs.no_photo"
     assert json.loads((output / "run.json").read_bytes())["pairs"] == str(pairs)
+    # Other pairs are another run, whatever their file is called.
+    pairs.write_text(text.replace("2.jpg", "3.jpg"))
+    assert run("batch", dataset, *asked, "--output", output) == 1
+
+
+def test_names_that_a_pairs_file_cannot_hold_are_refused_before_anything_is_asked(
+    http_url: str, make_dataset: Callable[..., Path], tmp_path: Path, service: Any
+) -> None:
+    dataset = make_dataset({"q/a.jpg": HERE})
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    (photos / "a, b.jpg").write_bytes(next((dataset / "sensors").rglob("a.jpg")).read_bytes())
+    asked = ["--map", "room", "--server", http_url, "--output", tmp_path / "pairs.txt"]
+    assert run("retrieve", photos, *asked) == 1
+    assert not service.seen
 
 
 def test_what_was_retrieved_is_written_and_read_again(

@@ -34,6 +34,13 @@ ALL: dict[str, Any] = {
         "covariance": COVARIANCE,
     },
     "gravity": {"direction": [0.0, 1.0, 0.0], "std_deg": 2.0, "world": [0.0, 0.0, -1.0]},
+    "gnss": {
+        "latitude": 48.1,
+        "longitude": -8.2,
+        "accuracy": 4.5,
+        "altitude": 412.0,
+        "vertical_accuracy": 9.0,
+    },
 }
 
 
@@ -48,6 +55,7 @@ def test_priors_come_back_as_they_were_given() -> None:
         np.testing.assert_allclose(pose["device_from_world"][name], numbers, atol=1e-15)
     assert again["gravity"]["std_deg"] == pytest.approx(2.0)
     assert again["gravity"]["world"] == [0.0, 0.0, -1.0]
+    assert again["gnss"] == ALL["gnss"]
 
 
 def test_nothing_known_is_nothing_sent() -> None:
@@ -78,6 +86,21 @@ def test_priors_are_json_or_a_file(tmp_path: Path) -> None:
         ({"maps": []}, "priors.maps", "priors.maps"),
         ({"height": {"min": 0, "max": True}}, "request.invalid", "priors.height.max"),
         ({"height": {"min": 0, "max": 10**400}}, "request.invalid", "priors.height.max"),
+        (
+            {"gnss": {"latitude": 91, "longitude": 0, "accuracy": 1}},
+            "priors.gnss",
+            "priors.gnss.latitude",
+        ),
+        (
+            {"gnss": {"latitude": 1, "longitude": 0, "accuracy": 0}},
+            "priors.gnss",
+            "priors.gnss.accuracy",
+        ),
+        (
+            {"gnss": {"latitude": 1, "longitude": 0, "accuracy": 1, "altitude": 400}},
+            "priors.gnss",
+            "priors.gnss.vertical_accuracy",
+        ),
         ({"height": {"min": 0, "maximum": 1}}, "request.unknown_field", "priors.height.maximum"),
         (
             {"position": {"position": [1, 2], "radius": 1}},

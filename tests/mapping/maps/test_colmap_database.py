@@ -124,3 +124,13 @@ def test_other_formats_take_no_queries(sfm_walk: Map, walk: Path, tmp_path: Path
         export_map(sfm_walk, tmp_path / "out", "ply", queries)
     assert caught.value.code == "export.queries"
     assert not (tmp_path / "out").exists()
+
+
+def test_photos_of_the_map_are_no_queries(sfm_walk: Map, walk: Path, tmp_path: Path) -> None:
+    queries = Queries(
+        read_dataset(walk / "mapping"), Localizer(sfm_walk, make_local_features("sift"))
+    )
+    with pytest.raises(InvalidInput) as caught:
+        export_map(sfm_walk, tmp_path / "out", "colmap", queries)
+    assert caught.value.code == "export.no_queries"
+    assert not (tmp_path / "out").exists()

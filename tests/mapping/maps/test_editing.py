@@ -224,6 +224,10 @@ def test_maps_that_cannot_be_joined(built: Map) -> None:
     with pytest.raises(Conflict) as error:
         joined(content, replace(content, local_fingerprint=other))
     assert error.value.code == "merge.features"
+    none = selected(content, landmarks=np.zeros(len(built.landmarks), np.bool_))
+    with pytest.raises(Conflict) as error:
+        joined(content, replace(none, images=()))
+    assert error.value.code == "merge.landmarks"
 
 
 def test_photos_go_with_their_rows(built: Map, tmp_path: Path) -> None:

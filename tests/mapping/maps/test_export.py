@@ -210,6 +210,18 @@ def test_our_reader_reads_the_same_dataset(opened: Map, tmp_path: Path) -> None:
     }
 
 
+def test_fixes_of_the_dataset_come_back_as_they_were(
+    built_maps: Path, sample: Path, tmp_path: Path
+) -> None:
+    dataset = read_dataset(sample / "mapping")
+    assert dataset.gnss
+    export_map(MapStore(built_maps).open("room"), tmp_path / "out", "kapture")
+    again = read_dataset(tmp_path / "out")
+    assert again.gnss == dataset.gnss
+    receiver = dataset.gnss[0].sensor_id
+    assert again.sensors[receiver].params == dataset.sensors[receiver].params
+
+
 def test_ready_made_features_keep_their_own_name(tmp_path: Path) -> None:
     export_map(make_map(tmp_path / "map", local="kapture:r2d2_500"), tmp_path / "out", "kapture")
     assert open_features(tmp_path / "out", "keypoints", "r2d2_500").read(NAMES[0]) is not None

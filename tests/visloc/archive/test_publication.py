@@ -132,8 +132,8 @@ def test_two_versions_that_are_published_at_once_are_both_there(
 
 
 @pytest.mark.parametrize("shift", [0.0, 1.0])
-# Two for what the server can do, then file by file; 13 is the landmarks, 18 the manifest.
-@pytest.mark.parametrize("step", [1, 2, 9, 13, 14, 18, 19])
+# Two for what the server can do, then file by file; 14 is the landmarks, 19 the manifest.
+@pytest.mark.parametrize("step", [1, 2, 9, 14, 15, 19, 20])
 def test_of_two_that_publish_the_same_version_one_does_at_whatever_step_the_other_comes(
     new_store: NewStore, make: Callable[..., Path], step: int, shift: float
 ) -> None:
@@ -148,7 +148,7 @@ def test_of_two_that_publish_the_same_version_one_does_at_whatever_step_the_othe
     outcomes.append(publish(slow, first, "v1"))
 
     # The faster one loses where it meets other bytes of the slower one.
-    early = "map.upload_runs" if step > 13 and shift and step < 19 else "map.version_exists"
+    early = "map.upload_runs" if step > 14 and shift and step < 20 else "map.version_exists"
     assert sorted(outcomes) == [early, "published"]
     reader = new_store("reader")
     opened = verify_map(reader.folder("room"))

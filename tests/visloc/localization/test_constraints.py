@@ -15,7 +15,7 @@ from visloc.archive import MapStore
 from visloc.archive.schema import Parts
 from visloc.errors import InvalidInput
 from visloc.evaluation import pose_error
-from visloc.geometry import Camera, Pose, covariance_from_center
+from visloc.geometry import Camera, Pose, Similarity, covariance_from_center
 from visloc.localization.constraints import Constraints, MapGeometry
 from visloc.localization.localizer import Localizer
 from visloc.options import LocalizeOptions
@@ -23,6 +23,7 @@ from visloc.pose.colmap import normalized_rays, project
 from visloc.pose.views import MatchedView
 from visloc.priors import (
     NO_PRIORS,
+    GnssPrior,
     GravityPrior,
     HeightBand,
     PosePrior,
@@ -214,6 +215,26 @@ def test_what_contradicts_is_said_with_numbers(hall: Any) -> None:
     turned = Pose(np.eye(3), -world.center)
     words = said(Priors(pose=PosePrior(turned, np.diag([1e-4] * 3 + [1e14] * 3))))
     assert "degrees from the prior pose" in words
+
+
+def test_a_fix_narrows_the_search_and_is_checked_afterwards(hall: Any) -> None:
+    # A metre is two units. The fix is above (9, 0) of the line, and its height is unknown.
+    above = hall.origin + np.array([9.0, 0.0, 77.0])
+    fix_from_world = Similarity(0.5, np.eye(3), -0.5 * above)
+    fix = GnssPrior(48.0, 8.0, 0.5, fix_from_world=fix_from_world)
+    weights = Constraints(hall.geometry_of(LINE), Priors(gnss=fix)).photo_weights
+    assert weights is not None
+    x = np.array(LINE)[:, 0]
+    beyond = np.maximum(np.abs(x - 9.0) - 3.0, 0.0) / 5.0  # photos see 5 far
+    expected = np.where(beyond <= 2.0, np.exp(-0.5 * beyond**2), 0.0)
+    assert weights == pytest.approx(expected)
+
+    constraints = Constraints(hall.geometry, Priors(gnss=fix))
+    assert constraints.narrow
+    said = constraints.contradiction(Pose(np.eye(3), np.array([-5.0, 0, 0])), spread(0.01))
+    assert said == "it lies 1.00 outside what the GNSS prior allows"
+    assert constraints.contradiction(Pose(np.eye(3), np.array([-6.1, 0, 0])), spread(0.01)) is None
+    assert constraints.contradiction(Pose(np.eye(3), np.array([-5.0, 0, 0])), spread(0.5)) is None
 
 
 def test_a_pose_prior_is_compared_in_units_of_both_uncertainties(place: Any) -> None:

@@ -5,7 +5,13 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from visloc.retrieval.interpolation import WEIGHTINGS, barycentric, cosine_similarity, joined
+from visloc.retrieval.interpolation import (
+    MOST_EXTRAPOLATED,
+    WEIGHTINGS,
+    barycentric,
+    cosine_similarity,
+    joined,
+)
 from visloc.types import CoarseMethod
 
 
@@ -42,6 +48,14 @@ def test_barycentric_weights_are_those_of_a_search(seed: int) -> None:
     )
 
     np.testing.assert_allclose(barycentric(query, photos), found.x, atol=1e-6)
+
+
+def test_photos_that_are_almost_the_same_get_no_huge_weights() -> None:
+    query, photos = some(2)
+    photos[1] = photos[0] + 1e-6 * np.linspace(-1, 1, photos.shape[1])
+    weights = barycentric(query, photos)
+    assert weights.sum() == pytest.approx(1.0)
+    assert np.abs(weights - 1 / len(photos)).sum() == pytest.approx(MOST_EXTRAPOLATED)
 
 
 def test_a_query_made_of_photos_gets_their_weights() -> None:

@@ -11,7 +11,15 @@ from visloc.archive import Anchor, Geodetic, SetOutline
 from visloc.errors import InvalidInput, NotFound
 from visloc.geodesy import geodetic_from_enu
 from visloc.geometry import Pose
-from visloc.priors import NO_PRIORS, GravityPrior, HeightBand, PosePrior, PositionPrior, Priors
+from visloc.priors import (
+    NO_PRIORS,
+    GnssPrior,
+    GravityPrior,
+    HeightBand,
+    PosePrior,
+    PositionPrior,
+    Priors,
+)
 from visloc.sets.choosing import (
     allowed_tiles,
     is_clear,
@@ -63,6 +71,13 @@ def test_tiles_near_are_those_whose_boxes_reach_into_a_circle(outline: MakeOutli
         ((latitude, longitude, _),) = geodetic_from_enu(np.array([[east, north, 0.0]]), origin)
         found = tiles_near(anchored, latitude, longitude, radius)
         assert found.tolist() == expected
+    # A fix 1 m north of the last house, whose photos see 1 m far, by a unit of 0.5 m.
+    ((latitude, longitude, _),) = geodetic_from_enu(np.array([[-2.5, 56.0, 0.0]]), origin)
+    fix = Priors(gnss=GnssPrior(latitude, longitude, 1.0))
+    assert allowed_tiles(anchored, fix).tolist() == [False, False, True]
+    assert nearest_tile(anchored, fix) == 2
+    with pytest.raises(InvalidInput):
+        allowed_tiles(houses, fix)
 
 
 def test_tiles_that_are_asked_for_are_narrowed_further(outline: MakeOutline) -> None:

@@ -14,7 +14,15 @@ from visloc.localization.constraints import Constraints
 from visloc.options import ReadAs
 from visloc.pose.centre import moved_pose, position_covariance
 from visloc.pose.distance import mahalanobis2
-from visloc.priors import NO_PRIORS, GravityPrior, HeightBand, PosePrior, PositionPrior, Priors
+from visloc.priors import (
+    NO_PRIORS,
+    GnssPrior,
+    GravityPrior,
+    HeightBand,
+    PosePrior,
+    PositionPrior,
+    Priors,
+)
 from visloc.sets.frame import answer_in_set, priors_in_tile, scaled_device
 from visloc.types import (
     CameraSource,
@@ -149,6 +157,15 @@ def test_priors_say_the_same_of_a_place_in_both_frames() -> None:
     assert priors.gravity.world is not None
     np.testing.assert_allclose(priors.gravity.world, [0, 0, -1], atol=1e-9)
     assert priors.maps is None
+
+
+def test_a_fix_allows_the_same_places_in_both_frames() -> None:
+    fix_from_set = Similarity(0.5, SET_FROM_TILE.rotation, np.array([3.0, -4.0, 5.0]))
+    fix = GnssPrior(48.0, 8.0, 0.5, 400.0, 1.0, fix_from_set)
+    moved = priors_in_tile(Priors(gnss=fix), SET_FROM_TILE, None).gnss
+    assert moved is not None
+    points = RANDOM.normal(size=(20, 3)) * 10
+    np.testing.assert_allclose(moved.beyond(points), fix.beyond(SET_FROM_TILE.apply(points)))
 
 
 def test_down_of_the_set_serves_a_height_band() -> None:

@@ -25,7 +25,7 @@ from service.grpc import messages
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera, Pose
 from visloc.options import LocalizeOptions as CoreOptions
-from visloc.priors import GravityPrior, HeightBand, PosePrior, PositionPrior, Priors
+from visloc.priors import GnssPrior, GravityPrior, HeightBand, PosePrior, PositionPrior, Priors
 from visloc.sequences.filling import TimeUnit
 from visloc_api.v1 import localization_pb2 as pb2
 from visloc_api.words.json_text import check_names_once
@@ -44,6 +44,7 @@ PRIORS = Priors(
     height=HeightBand(-1.0, 2.5),
     pose=PosePrior(POSE, COVARIANCE),
     gravity=GravityPrior(np.array([0.0, 1.0, 0.0]), math.radians(2.0), np.array([0.0, 0.0, -1.0])),
+    gnss=GnssPrior(48.1, -8.2, 4.5, 412.0, 9.0),
     maps=("hall", "attic@2"),
 )
 RNG = np.random.default_rng(0)

@@ -13,8 +13,10 @@ export {
   localizeForm,
   type FeatureArray,
   type Features,
+  type GnssPrior,
   type LocalizeCall,
   type Photo,
+  type Priors,
   type RigCall,
   type RigImage,
 } from "./requests.js";

@@ -18,6 +18,11 @@ export interface Features {
   descriptors: FeatureArray;
   /** D numbers for each of the map's `global_features`. */
   global_descriptors: Record<string, FeatureArray>;
+  /**
+   * By the name of a mapping photo, k x 3: the row of a keypoint, and x, y of the photo's keypoint
+   * that another program matched it with. When there are any, the service matches nothing itself.
+   */
+  matches?: Record<string, FeatureArray>;
 }
 
 /** A photo, or what was found in it, with its intrinsics where they are known. */
@@ -30,13 +35,36 @@ interface Asked {
   camera?: Camera | null;
 }
 
+/** Where a satellite receiver has the device, such as `coords` of the browser's geolocation. */
+export interface GnssPrior {
+  /** Degrees, WGS84. */
+  latitude: number;
+  longitude: number;
+  /** Metres: the horizontal radius that holds 68 % of fixes. */
+  accuracy: number;
+  /** Metres above the ellipsoid, with its accuracy. */
+  altitude?: number | null;
+  vertical_accuracy?: number | null;
+}
+
+/** What is known of the place beforehand (docs/api.md, "Priors"). */
+export interface Priors {
+  /** x, y, z in the world, and a radius in its unit. */
+  position?: { position: number[]; radius: number };
+  height?: { min: number; max: number };
+  pose?: { device_from_world: Transform; covariance: number[] };
+  gravity?: { direction: number[]; std_deg?: number; world?: number[] };
+  gnss?: GnssPrior;
+  /** Tiles of a set that the device may be in. */
+  maps?: string[];
+}
+
 /** Where to look, and how: the fields of docs/api.md. */
 interface Where {
   /** An id or `id@version`. */
   map: string;
   options?: Record<string, string | number>;
-  /** What is known of the place beforehand. */
-  priors?: unknown;
+  priors?: Priors;
 }
 
 export interface LocalizeCall extends Where, Asked {
@@ -99,7 +127,8 @@ export function rigForm(call: RigCall): FormData {
 
 const blobOf = (photo: Photo): Blob => (photo instanceof Blob ? photo : new Blob([photo]));
 
-function featuresJson({ kind, keypoints, descriptors, global_descriptors }: Features): unknown {
+function featuresJson(features: Features): unknown {
+  const { kind, keypoints, descriptors, global_descriptors, matches } = features;
   const count = keypoints.length / 2;
   const described = Object.entries(global_descriptors).map(([name, numbers]): [string, unknown] => [
     name,
@@ -110,7 +139,16 @@ function featuresJson({ kind, keypoints, descriptors, global_descriptors }: Feat
     keypoints: arrayJson(keypoints, [count, 2]),
     descriptors: arrayJson(descriptors, [count, count > 0 ? descriptors.length / count : 0]),
     global_descriptors: Object.fromEntries(described),
+    ...(matches === undefined ? {} : { matches: matchesJson(matches) }),
   };
+}
+
+function matchesJson(matches: Record<string, FeatureArray>): unknown {
+  const arrays = Object.entries(matches).map(([name, rows]): [string, unknown] => [
+    name,
+    arrayJson(rows, [rows.length / 3, 3]),
+  ]);
+  return Object.fromEntries(arrays);
 }
 
 /** Little-endian, as every machine that runs JavaScript is. */

@@ -95,6 +95,18 @@ export interface RigPose extends Estimate {
   rig_from_world: Transform;
 }
 
+/** Where the most similar mapping photos say that a refused photo was taken: `fallback=coarse`. */
+export interface CoarsePose {
+  cam_from_world: Transform;
+  position: number[];
+  orientation: number[];
+  /** 6 x 6, row by row: rotation, then translation; the ellipsoid of 95 % holds. */
+  covariance: number[];
+  position_std: number[];
+  orientation_std_deg: number[];
+  method: "bdi" | "csi" | "ewb";
+}
+
 /** One of the two places between which an ambiguous photo leaves the choice. */
 export interface Candidate {
   /** In whose frame the pose is: a map, or a set of maps. */
@@ -139,6 +151,8 @@ export interface LocalizeResponse {
   status: "localized" | "coarse" | "not_localized";
   pose: PoseEstimate | null;
   refusal: Refusal | null;
+  /** Where `status` is `coarse`. */
+  coarse: CoarsePose | null;
   keypoints: number;
   correspondences: number;
   inliers: number;

@@ -1,5 +1,5 @@
 // The answer to a photo: a pose, or how far the photo came and what to try.
-import { mapRef, type LocalizeResponse, type PoseEstimate } from "visloc-client";
+import { mapRef, type CoarsePose, type LocalizeResponse, type PoseEstimate } from "visloc-client";
 import { button, element, facts } from "../dom";
 import { ellipsoid95, lengthText, REACH_95 } from "../geometry";
 import { copyText, textsToCopy } from "./copying";
@@ -37,7 +37,7 @@ export function answerView(
     "div",
     { class: "stack answer" },
     ...(actions.chooseMap === null ? [] : [ofAnotherMap(answer, actions.chooseMap)]),
-    pose === null ? refused(answer, actions.options) : localized(answer, pose, actions.metric),
+    pose === null ? refused(answer, actions) : localized(answer, pose, actions.metric),
     ...candidateList(answer, actions),
     photoPicture(entry.photo, answer),
     ...(pose === null ? [] : [poseTable(pose, actions.metric)]),
@@ -90,7 +90,7 @@ function ofAnotherMap({ map }: LocalizeResponse, choose: () => void): HTMLElemen
 export function inShort(answer: LocalizeResponse): string {
   return answer.pose !== null
     ? `localized, ${countText(answer.inliers)} inliers`
-    : `not localized: ${answer.refusal?.message ?? ""}`;
+    : `${answer.coarse ? "coarse" : "not localized"}: ${answer.refusal?.message ?? ""}`;
 }
 
 const COVERED = {
@@ -118,7 +118,7 @@ function localized(answer: LocalizeResponse, pose: PoseEstimate, metric: boolean
   );
 }
 
-function refused(answer: LocalizeResponse, options: Record<string, string | number>): HTMLElement {
+function refused(answer: LocalizeResponse, { options, metric }: AnswerActions): HTMLElement {
   const { meaning, tries } = advice(answer, options);
   const states = outcomes(answer);
   const said = { passed: "passed", stopped: "stopped here", not_reached: "not reached" };
@@ -135,6 +135,7 @@ function refused(answer: LocalizeResponse, options: Record<string, string | numb
     { class: "verdict unsure stack near" },
     element("h2", {}, "The map says: I do not know."),
     element("ol", { class: "pipeline", "aria-label": "How far the photo came" }, ...steps),
+    ...(answer.coarse ? [element("p", {}, coarseWords(answer.coarse, metric))] : []),
     element("p", {}, meaning),
     element(
       "p",
@@ -143,6 +144,15 @@ function refused(answer: LocalizeResponse, options: Record<string, string | numb
     ),
     element("h3", {}, "What to try"),
     element("ul", { class: "tries" }, ...tries.map((text) => element("li", {}, text))),
+  );
+}
+
+/** What a coarse pose is worth, whose ellipsoid the 3D view draws. */
+function coarseWords(coarse: CoarsePose, metric: boolean): string {
+  const [reach] = ellipsoid95(covarianceOfPosition(coarse)).halfAxes;
+  return (
+    "Coarse: the most similar mapping photos were taken about here. Nothing confirms it; with 95 % " +
+    `the photo was taken within the ellipsoid that is drawn, at most ${lengthText(reach, metric, 2)} away.`
   );
 }
 

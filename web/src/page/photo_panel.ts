@@ -267,10 +267,11 @@ export function createPhotoPanel(host: HTMLElement, parts: PhotoPanelParts): Pho
     drawn = answer === null ? [] : shownPlaces(answer);
     viewer.showPoses(drawn);
     viewer.highlight(answer === null ? new Set() : retrievedOf(answer));
-    photoView.hidden = answer?.pose == null;
+    const isPlaced = answer?.pose != null || answer?.coarse != null;
+    photoView.hidden = !isPlaced;
     if (!fly) return;
     // Of a refused photo, where it was looked for.
-    if (answer?.pose != null) flyTo(0);
+    if (isPlaced) flyTo(0);
     else if (answer !== null) viewer.overview();
   }
   function flyTo(place: number): void {

@@ -1,0 +1,81 @@
+"""What each table of docs/results.md is made by.
+
+A table is the rows that its scripts print, under one header. ``DATA``, ``MAPS`` and ``WORK`` in a
+command stand for the folders of the run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Build:
+    """A map that tables are measured in: ``mapping build DATA/dataset/mapping`` with options."""
+
+    dataset: str
+    options: Sequence[str] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """How a table is made.
+
+    Attributes:
+        runs: by what stands in the first column before the rows that it prints, arguments of
+            ``python``. One run without a name adds no column.
+        maps: names in ``MAPS`` of the maps that it asks.
+    """
+
+    runs: Mapping[str, Sequence[str]]
+    maps: Sequence[str] = ()
+
+
+_SFM = ("--method", "sfm", "--pairs", "distance")
+_BARE = ("--method", "retrieval-only")
+_SETS = ("castle", "kitti_curve", "redkitchen")
+_AFTER = "benchmarks/after_the_pose.py"
+
+MAPS: Mapping[str, Build] = {
+    "castle": Build("castle", _SFM),
+    "castle-bare": Build("castle", _BARE),
+    "gardenspoint-bare": Build("gardenspoint", (*_BARE, "--not-metric")),
+    "kitti_curve": Build("kitti_curve", _SFM),
+    "redkitchen": Build("redkitchen"),
+}
+
+
+def _ways(dataset: str, *ways: str) -> Table:
+    script = "benchmarks/map_methods.py"
+    return Table({"": (script, f"DATA/{dataset}", *ways, "--maps-dir", "WORK/ways")})
+
+
+def _local_sfm(map_id: str, dataset: str) -> Sequence[str]:
+    return ("-m", "benchmarks.local_sfm", "MAPS", map_id, f"DATA/{dataset}/query")
+
+
+TABLES: Mapping[str, Table] = {
+    "without-landmarks": Table(
+        {
+            "castle, no landmarks": _local_sfm("castle-bare", "castle"),
+            "castle, landmarks": _local_sfm("castle", "castle"),
+            "gardenspoint by day, no landmarks": _local_sfm("gardenspoint-bare", "gardenspoint"),
+        },
+        ("castle-bare", "castle", "gardenspoint-bare"),
+    ),
+    "redkitchen-ways": _ways(
+        "redkitchen", "rgbd", "sfm:retrieval", "sfm:distance", "sfm:frustum", "sfm:covisibility"
+    ),
+    "castle-pairings": _ways(
+        "castle", "sfm:distance", "sfm:retrieval", "sfm:frustum", "sfm:covisibility"
+    ),
+    "pairings-10000": Table({"": ("benchmarks/pairing.py",)}),
+    "after-the-pose": Table(
+        {each: (_AFTER, f"MAPS/{each}", f"DATA/{each}/query") for each in _SETS},
+        _SETS,
+    ),
+    "ready-made-rounding": Table(
+        {"": ("-m", "benchmarks.ready_made_rounding", "DATA/virtual_gallery")}
+    ),
+}

@@ -1,0 +1,88 @@
+"""GNSS fixes of a map's captures, kept as they were recorded (``gnss.json``)."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from visloc.archive.checks import read_record
+from visloc.archive.reader import Map
+from visloc.archive.schema import Record
+
+GNSS_FILE = "gnss.json"
+
+
+class GnssFix(Record):
+    """One fix, with the numbers of kapture's ``records_gnss.txt``.
+
+    Attributes:
+        timestamp: in the unit of the photos' timestamps.
+        receiver: its name in ``Fixes.receivers``.
+        x: longitude in degrees for EPSG:4326, otherwise easting.
+        y: latitude in degrees for EPSG:4326, otherwise northing.
+        z: altitude in metres.
+        utc: Unix time in seconds, 0 when unknown.
+        dop: dilution of precision, 0 when unknown.
+    """
+
+    timestamp: int
+    receiver: Annotated[str, Field(max_length=1000)]
+    x: float
+    y: float
+    z: float
+    utc: float
+    dop: float
+
+
+class Fixes(Record):
+    """``gnss.json``. ``receivers`` has the parameters of each, of which the first is the system."""
+
+    receivers: dict[str, tuple[str, ...]]
+    fixes: tuple[GnssFix, ...]
+
+    @model_validator(mode="after")
+    def _names_its_receivers(self) -> Fixes:
+        if not {fix.receiver for fix in self.fixes} <= self.receivers.keys():
+            raise ValueError("a fix is of a receiver that is not listed")
+        return self
+
+    def joined(self, other: Fixes) -> Fixes:
+        """Return the fixes of both; receivers of one name that contradict each other are two."""
+        known = {(fix.timestamp, fix.receiver): fix for fix in self.fixes}
+        renamed = {
+            name: name if self._fits(name, other, known) else self._free(name, other)
+            for name in other.receivers
+        }
+        more = (fix.model_copy(update={"receiver": renamed[fix.receiver]}) for fix in other.fixes)
+        return Fixes(
+            receivers={
+                **self.receivers,
+                **{renamed[name]: params for name, params in other.receivers.items()},
+            },
+            # What both have of one receiver and time is the same, and one.
+            fixes=tuple({**known, **{(fix.timestamp, fix.receiver): fix for fix in more}}.values()),
+        )
+
+    def _fits(self, name: str, other: Fixes, known: dict[tuple[int, str], GnssFix]) -> bool:
+        if name in self.receivers and self.receivers[name] != other.receivers[name]:
+            return False
+        own = (fix for fix in other.fixes if fix.receiver == name)
+        return all(known.get((fix.timestamp, name), fix) == fix for fix in own)
+
+    def _free(self, name: str, other: Fixes) -> str:
+        number = 2
+        while f"{name}-{number}" in self.receivers or f"{name}-{number}" in other.receivers:
+            number += 1
+        return f"{name}-{number}"
+
+
+def read_fixes(opened: Map) -> Fixes | None:
+    """Return the fixes that a map keeps; None for a map without any.
+
+    Raises:
+        MapCorrupt: ``map.json`` when the file is damaged.
+    """
+    if GNSS_FILE not in opened.manifest.files:
+        return None
+    return read_record(opened.path, GNSS_FILE, Fixes)
