@@ -346,12 +346,13 @@ class CommandFailed(Exception):
 
 @dataclass
 class Desk:
-    """A folder as a page's reader has it, and the service that was started there last."""
+    """A reader's folder, the service that was started there last, and all that was printed."""
 
     folder: Path
     http: str = ""
     grpc: str = ""
     service: subprocess.Popen[bytes] | None = None
+    printed: str = ""
 
     def run(self, command: Command) -> None:
         """Run a command.
@@ -374,9 +375,10 @@ class Desk:
         for printed, here in SMALLER.items():
             text = text.replace(printed, here)
         if command.is_python:
-            call(self.folder, [sys.executable, "-c", text])
+            self.printed += call(self.folder, [sys.executable, "-c", text])
             return
         printed = call(self.folder, ["bash", "-o", "pipefail", "-c", text + self.added(command)])
+        self.printed += printed
         if command.words[0] == "curl" and json.loads(printed)["status"] != "localized":
             raise CommandFailed(printed)
 
