@@ -158,7 +158,7 @@ RULES = (
     Rule(Tier.ELSEWHERE, r"", r"kubectl ", "a cluster; tests/test_deploy_kubernetes.py"),
     Rule(Tier.ELSEWHERE, r"", r"export VISLOC_API_KEY", "a key of the reader's own"),
     Rule(Tier.ELSEWHERE, r"", r"python -m http\.server", "would not end; test_web_overlay.py"),
-    Rule(Tier.ELSEWHERE, r"", r"pip install", "a package index; tests/examples/test_plugin.py"),
+    Rule(Tier.ELSEWHERE, r"", r"pip (install|wheel)", "pip; tests/examples/test_plugin.py"),
     Rule(Tier.ELSEWHERE, r"", r"curl .*//maps\.example\.org", "a host of that name"),
     Rule(Tier.PARSED, r"", r"([A-Z]+=\S+ |[A-Z]+=\".*\" )?make ", "a target of its own"),
     Rule(Tier.PARSED, r"examples/plugin", r"", "needs it installed; tests/examples/test_plugin.py"),
