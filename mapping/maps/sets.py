@@ -284,7 +284,7 @@ def _world(placed: Sequence[_Placed]) -> SetWorld:
 
 
 def _refuse_other_place(placed: Sequence[_Placed], geodetic: Geodetic) -> None:
-    """Refuse maps whose own anchors put their photos elsewhere on Earth than the set's anchor does."""
+    """Refuse maps whose anchors put their photos elsewhere on Earth than the set's does."""
     for one in placed:
         own = None if one.anchor is None else one.anchor.geodetic
         if own is None:

@@ -143,8 +143,8 @@ def _compared(
     count, lists = max(_MIN_PROPOSED, _PROPOSED_PER_RESULT * top_k), _LISTS
     many = left > _MAX_DOUBTFUL
     if many:
-        # Photos that priors leave may lie in lists further away; if few, doubts about the
-        # proposals cost less than more lists.
+        # Photos that priors leave may lie in lists further away. If there are few, checking
+        # doubtful proposals is cheaper than more lists.
         lists = math.ceil(lists * len(allowed) / left)
     photos, limits = _proposed(query, files, allowed, min(left, count), lists)
     cosines = _cosines(query, index, photos)
