@@ -109,7 +109,7 @@ def verdict(trials: Trials, captured: Captured, opened: Map) -> str:
 
 
 def film_again(trials: Trials, stretches: Sequence[Stretch], opened: Map) -> list[str]:
-    """What to film again, and how."""
+    """Return what to film again, and how."""
     advice = {
         NOT_CONNECTED: "was not connected to the rest: film it again, beginning and ending where "
         "the map is good",

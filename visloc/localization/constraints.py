@@ -215,7 +215,7 @@ class Constraints:
 
     @property
     def errors(self) -> MapErrors:
-        """Of the map."""
+        """The map's own errors, which widen every covariance."""
         return self.geometry.errors
 
     @property

@@ -29,7 +29,7 @@ class Viewpoints:
         return len(self.centers)
 
     def of(self, images: NDArray[np.int64]) -> Viewpoints:
-        """Those of some photos."""
+        """Return the viewpoints of some photos."""
         return Viewpoints(self.centers[images], self.rotations[images], self.reach)
 
     def pose(self, image: int) -> Pose:

@@ -148,7 +148,7 @@ def _near(view: MatchedView, rig_from_world: Pose, max_error_px: float) -> Match
 
 
 def _promised_gain(state: _State, max_error_px: float, width: float) -> float:
-    """What ``gain`` would be if the loss were quadratic; 0 when the matches are too few."""
+    """``gain`` as it would be with a quadratic loss; 0 when there are too few matches."""
     normal = _normal_equations(state, max_error_px, width)
     if normal is None:
         return 0.0
@@ -229,7 +229,7 @@ def _state(
 
 
 def _loss(state: _State, max_error_px: float, width: float = 1.0) -> float:
-    """Of all matches, px^2; constant beyond the threshold and behind the camera."""
+    """Return the loss of all matches, px^2; constant beyond the threshold and behind the camera."""
     squared = np.sum(state.errors**2, axis=1)
     largest, scale2 = (width * max_error_px) ** 2, (width * LOSS_SCALE_PX) ** 2
     squared = np.where(squared <= largest, squared, largest)  # NaN too
