@@ -63,7 +63,7 @@ def like(line: str) -> str:
     """Return a pattern for a line of output: any numbers and versions, and any spaces."""
     parts = re.split(r"(@[\w.-]+|-?\d[\d.]*)", " ".join(line.split()))
     for i, part in enumerate(parts):
-        number = r"@[\w.-]+" if part.startswith("@") else r"\s?-?\d[\d.e-]*"
+        number = r"@[\w.-]+" if part.startswith("@") else r"\s?-?\d[\d.e-]*\s?"
         parts[i] = number if i % 2 else re.escape(part)
     return "".join(parts)
 
@@ -73,6 +73,7 @@ def like(line: str) -> str:
     [
         ("position  0.94 -3.1 m", "a position 7 4.1 m", True),
         ("[0.94 0.32]", "[ 1. 2]", True),
+        ("6 [0.94 0.32]", "9 [0.5 0.25 ]", True),
         ("tile  a@2026-1f", "tile b@2026-1f", False),
         ("tile  a@2026-1f", "tile a@2027-ff", True),
         ("6 matrices", "matrices", False),
