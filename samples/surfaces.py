@@ -1,4 +1,4 @@
-"""What the surfaces of the sample room look like.
+"""The look of the sample room's surfaces.
 
 Each function paints one surface, (height, width, 3) uint8 RGB, ``TEXELS_PER_M`` texels per
 metre, and no two calls with different generators give the same picture. All of them carry

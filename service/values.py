@@ -108,7 +108,7 @@ class InstantJob:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SequenceJob:
-    """What all instants of a sequence share.
+    """The values that all instants of a sequence share.
 
     Attributes:
         maps: of several maps, the first that alone explains an instant is kept.
@@ -217,7 +217,7 @@ class MapFolder(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class WorkerSettings:
-    """What a worker process needs to know.
+    """The settings of a worker process.
 
     Attributes:
         threads: most processor threads for one photo.

@@ -158,7 +158,7 @@ RULES = (
     Rule(Tier.ELSEWHERE, r"", r"kubectl ", "a cluster; tests/test_deploy_kubernetes.py"),
     Rule(Tier.ELSEWHERE, r"", r"export VISLOC_API_KEY", "a key of the reader's own"),
     Rule(Tier.ELSEWHERE, r"", r"python -m http\.server", "would not end; test_web_overlay.py"),
-    Rule(Tier.ELSEWHERE, r"", r"pip install", "a package index; tests/examples/test_plugin.py"),
+    Rule(Tier.ELSEWHERE, r"", r"pip (install|wheel)", "pip; tests/examples/test_plugin.py"),
     Rule(Tier.ELSEWHERE, r"", r"curl .*//maps\.example\.org", "a host of that name"),
     Rule(Tier.PARSED, r"", r"([A-Z]+=\S+ |[A-Z]+=\".*\" )?make ", "a target of its own"),
     Rule(Tier.PARSED, r"examples/plugin", r"", "needs it installed; tests/examples/test_plugin.py"),
@@ -347,12 +347,13 @@ class CommandFailed(Exception):
 
 @dataclass
 class Desk:
-    """A folder as a page's reader has it, and the service that was started there last."""
+    """A reader's folder, the service that was started there last, and all that was printed."""
 
     folder: Path
     http: str = ""
     grpc: str = ""
     service: subprocess.Popen[bytes] | None = None
+    printed: str = ""
 
     def run(self, command: Command) -> None:
         """Run a command.
@@ -375,9 +376,10 @@ class Desk:
         for printed, here in SMALLER.items():
             text = text.replace(printed, here)
         if command.is_python:
-            call(self.folder, [sys.executable, "-c", text])
+            self.printed += call(self.folder, [sys.executable, "-c", text])
             return
         printed = call(self.folder, ["bash", "-o", "pipefail", "-c", text + self.added(command)])
+        self.printed += printed
         if command.words[0] == "curl" and json.loads(printed)["status"] != "localized":
             raise CommandFailed(printed)
 

@@ -73,7 +73,7 @@ class VislocError(Exception):
 
 
 class InvalidInput(VislocError):
-    """What was sent or given cannot be used as it is."""
+    """The input cannot be used as it is."""
 
 
 class TooLarge(InvalidInput):
@@ -126,7 +126,7 @@ class StorageFull(Unavailable):
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """What the catalogue says about a code, or about a family of codes such as ``options.*``.
+    """The catalogue's entry of a code, or about a family of codes such as ``options.*``.
 
     Attributes:
         section: who raises it, for the docs.

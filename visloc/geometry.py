@@ -56,7 +56,7 @@ class PixelOrigin(StrEnum):
 
     @property
     def shift(self) -> float:
-        """What to add to its pixel coordinates to have ours."""
+        """The offset to add to its pixel coordinates to get ours."""
         return 0.5 if self is PixelOrigin.CENTER else 0.0
 
 

@@ -67,7 +67,7 @@ class PhotoResult:
 
     @property
     def status(self) -> Literal["localized", "coarse", "not_localized", "error"]:
-        """What came of it."""
+        """The outcome."""
         return "error" if self.answer is None else self.answer.status
 
     @property

@@ -1,4 +1,4 @@
-"""What a caller knows about a pose before any photo is looked at.
+"""Priors: what a caller knows about a pose before any photo is looked at.
 
 A prior is taken at its word: it narrows the search, and a pose that contradicts it is refused. It
 never bends a pose towards itself, so that a wrong one costs an answer and not the truth of one

@@ -111,6 +111,8 @@ def image(
             got = "an answer without the picture that was asked for"
             raise not_understood(connection.server, got)
         write_whole(debug, [result.debug.overlay])
+        if not as_json:
+            print_line(_out, "picture", str(debug))
     if not result.localized:
         raise typer.Exit(EXIT_NOT_LOCALIZED)
 

@@ -23,7 +23,7 @@ from visloc_api.words.options import CHOICES, LocalizeOptions
 
 
 class Axis(StrEnum):
-    """What is varied."""
+    """The choice that a comparison varies."""
 
     LOCAL_FEATURES = "local-features"  # a map for each
     GLOBAL_FEATURES = "global-features"  # of one map: each alone, then all together

@@ -51,7 +51,7 @@ _NAMES: Mapping[Benchmark, Callable[[str], str]] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Submission:
-    """What is sent in.
+    """The poses of a submission.
 
     Attributes:
         poses: by the benchmark's name, in the order of the results.

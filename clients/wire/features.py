@@ -17,7 +17,7 @@ from visloc_api.words.wire import ARRAY_DTYPES
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Features(QueryFeatures):
-    """What was found in one photo, for a map of the same kind of features.
+    """The features of one photo, for a map with the same kind of features.
 
     Arrays of float32, float16, uint8 and int8 are sent as they are, float64 as float32. Rows may
     have any length: the server normalizes descriptors. A global descriptor that is made of local

@@ -1,4 +1,4 @@
-"""What can be asked of a server, before any transport has a say in it."""
+"""Requests to a server, independent of the transport."""
 
 from __future__ import annotations
 

@@ -121,9 +121,9 @@ def verdict(trials: Trials, captured: Captured, opened: Map) -> str:
 
 
 def film_again(trials: Trials, stretches: Sequence[Stretch], opened: Map) -> list[str]:
-    """What to film again, and how.
+    """Return what to film again, and how.
 
-    Of a good map, single photos that are not found tell nothing: most are the ends of a walk.
+    In a good map, most single photos that are not found are the ends of a walk: they tell nothing.
     """
     advice = {
         NOT_CONNECTED: "nothing links it to the rest; begin and end where the map is good",

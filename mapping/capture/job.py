@@ -52,7 +52,7 @@ _BEGUN = "begun.json"
 
 @dataclass(frozen=True, slots=True)
 class Outlook:
-    """What a capture will take, told before the long work.
+    """The estimated cost of a capture, shown before the long work.
 
     Attributes:
         photos: that will be matched.

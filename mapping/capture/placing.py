@@ -28,7 +28,7 @@ _DISAGREES = 0.05
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Yardstick:
-    """What tells how long a unit of a map is.
+    """The sources that tell the unit of a map.
 
     Attributes:
         length: names of two photos and the metres between where they were taken; None without.

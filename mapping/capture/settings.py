@@ -60,7 +60,7 @@ def _known_length(given: tuple[str, str, str]) -> KnownLength:
 
 @dataclass(frozen=True, slots=True)
 class CaptureSettings:
-    """What to make a map of, and how."""
+    """The sources and options of a capture."""
 
     sources: Annotated[
         list[Path],

@@ -1,4 +1,4 @@
-"""What speaks against a capture's map: photos that do not come back, films whose path jumps."""
+"""Find doubts about a capture's map: photos that do not come back, films whose path jumps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the commands say of a version that its own test speaks against, and ``mapping use``."""
+"""Messages about a version that its own test speaks against, and ``mapping use``."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ def summary_of(opened: Map) -> dict[str, Any]:
 
 
 def _own_test(opened: Map) -> str:
-    """What the map's own test found, for people."""
+    """Return the result of the map's own test as text."""
     test = opened.manifest.parts.own_test
     if test is None:
         return "none: answers state the uncertainty of the photo only (mapping upgrade adds it)"

@@ -1,8 +1,8 @@
-"""How one frame lies in another, from photos of the one that were localized in the other.
+"""Align two frames, by photos of one frame that were localized in the other.
 
-Each photo says it alone, since its pose is known in both; a few centimetres of error in each would
-turn and shift the whole. So the similarity that most photos agree with is only the beginning: it
-is then refined over the 2D-3D matches of all those photos together, with one robust loss.
+A single photo would do, because its pose is known in both frames. But a few centimetres of error
+in its pose would turn and shift the whole frame. So pairs of photos propose similarities, and the
+one that most photos agree with is refined over all their 2D-3D matches, with one robust loss.
 """
 
 from __future__ import annotations
@@ -24,37 +24,39 @@ from visloc.pose.colmap import project
 from visloc.pose.refinement import LOSS_SCALE_PX
 
 MIN_PHOTOS = 3
-# Pairs of photos that propose a similarity.
+# How many pairs of photos propose a similarity.
 _NUM_TRIALS = 200
-# Matches of each photo that judge a proposal, and that refine what was chosen.
+# Matches of each photo that judge a proposal, and matches that refine the chosen one.
 _JUDGING, _REFINING = 32, 256
-# An alignment from one or two photos is a few times less exact than one from all of them.
+# Limits of a photo's median reprojection error, in units of the largest error of an inlier. For
+# proposals, as two photos align the frames a few times less exactly than all of them:
 _COARSE = 4.0
-# Poses of mapping photos are not exact either: those of redkitchen shift what a photo sees by 20
-# pixels. What was localized elsewhere is off by hundreds.
+# For the refined similarity, as poses of mapping photos are not exact: those of redkitchen shift
+# the projections by 20 pixels. A photo of another place is off by hundreds.
 _AGREES = 2.0
 _ROUNDS = 3
-# Largest error of the scale between two frames of one unit, which that of a map may have.
+# Largest difference of scale between two frames that are said to have one unit. A map's own scale
+# may be wrong by as much.
 _MAX_OTHER_UNIT = 0.02
-# Depths in the two frames may differ by this share. On redkitchen, errors of the depth camera and
-# of the poses together make 1 % at most.
+# Largest relative difference between the depths of the two frames. On redkitchen, errors of the
+# depth camera and of the poses together make 1 % at most.
 MAX_DEPTH_OFF = 0.03
-# After so many the weights of points change no more.
+# After so many rounds the weights of points change no more.
 _POINT_ROUNDS = 50
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seen:
-    """A photo that was localized in another frame than its own.
+    """A photo that was localized in another frame ("there") than its own ("here").
 
     Attributes:
-        pose_here: cam_from_here, in the frame that it comes from.
+        pose_here: cam_from_here.
         camera: intrinsics.
-        pixels: (n, 2) float64, inliers of ``pose_there``.
-        points: (n, 3) float64, what they see, in the other frame.
+        pixels: (n, 2) float64, keypoints of the inliers of ``pose_there``.
+        points: (n, 3) float64, the landmarks of these inliers, in the other frame.
         pose_there: cam_from_there, as it was localized.
-        own_points: (n, 3) float64, the same points where depth puts them in the photo's own frame;
-            None where it does not.
+        own_points: (n, 3) float64, the same points in the photo's own frame, from its depth; None
+            without depth.
     """
 
     pose_here: Pose
@@ -67,17 +69,16 @@ class Seen:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tie:
-    """How the frame of some photos lies in another one.
+    """How the frame of n photos lies in another one. The similarity gives each a "moved pose".
 
     Attributes:
         there_from_here: the similarity.
-        tied: (n,) the photos that agree with it.
-        errors_px: (n,) of each photo, the median reprojection error of its matches from where the
-            similarity puts it; infinity for one that looks away.
-        distances: (n,) from where the similarity puts it to where it was localized, in the other
-            frame's unit.
-        angles_deg: (n,) likewise.
-        num_back: photos of the other frame, localized in this one, that agree too.
+        tied: (n,) whether the photo agrees with it.
+        errors_px: (n,) median reprojection error of the photo's matches under its moved pose;
+            infinity if they lie behind the camera.
+        distances: (n,) from the moved pose to the localized pose, in the other frame's unit.
+        angles_deg: (n,) between the moved pose and the localized pose.
+        num_back: number of photos of the other frame, localized in this one, that agree too.
     """
 
     there_from_here: Similarity
@@ -93,8 +94,8 @@ class NoTie:
     """Why there is no tie.
 
     Attributes:
-        why: in words to follow "but".
-        unit: whether the photos agree, and the units of the frames, or of depth, do not.
+        why: the reason, as a clause that follows "but".
+        unit: whether the photos agree and only the unit of a frame, or of depth, differs.
     """
 
     why: str
@@ -107,16 +108,16 @@ def tie(
     """Find the similarity that photos of one frame, localized in another, agree on.
 
     Args:
-        photos: of this frame, seen in the other.
-        back: of the other frame, seen in this one; with them the similarity is also that which
-            explains what they see here. May be empty.
-        rigid: whether both frames have one unit.
+        photos: photos of this frame, localized in the other.
+        back: photos of the other frame, localized in this one. The similarity must explain their
+            matches too. May be empty.
+        rigid: whether both frames have one unit, so that the scale is 1.
         seed: equal seeds give equal ties.
 
     Returns:
-        The tie; or why there is none: fewer than three photos, not more
-        than half of them agree, they stand too close together to tell the scale, rigidly tied
-        they tell another one than 1, or depth has another unit than the poses.
+        The tie, or why there is none: fewer than three photos; at most half of them agree; without
+        ``rigid``, they stand too close together to tell the scale; with it, their scale is not 1;
+        or depth has another unit than the poses.
     """
     if len(photos) < MIN_PHOTOS:
         return NoTie(f"only {len(photos)} photos were localized, and {MIN_PHOTOS} are needed")
@@ -155,45 +156,45 @@ def tie(
 
 
 def other_depth(photos: Sequence[Seen], there_from_here: Similarity) -> str | None:
-    """Say that depth has another unit than a similarity, in words to follow "but"; or None.
+    """Say that depth has another unit, as a clause that follows "but"; None if it has not.
 
     Args:
-        photos: those that agree with it, with ``own_points``, one at least.
+        photos: photos that agree with the similarity, at least one, all with ``own_points``.
         there_from_here: the similarity.
     """
     return _other_depth([_View(seen, forward=True) for seen in photos], there_from_here)
 
 
 def refined_by_depth(photos: Sequence[Seen], start: Similarity, *, rigid: bool) -> Similarity:
-    """Refine the similarity of tied photos on what they see, where depth puts it.
+    """Refine a similarity on the points that its photos see, placed by depth.
 
     Args:
-        photos: those that agree with it, with ``own_points``.
+        photos: photos that agree with the similarity, all with ``own_points``.
         start: the similarity.
         rigid: whether both frames have one unit.
 
     Returns:
-        What must be judged again (``agreeing``).
+        The refined similarity. The photos may no longer agree with it: call ``agreeing`` again.
     """
     return _refined_by_depth([_View(seen, forward=True) for seen in photos], start, rigid=rigid)
 
 
 def agreeing(photos: Sequence[Seen], there_from_here: Similarity) -> NDArray[np.bool_]:
-    """Tell which photos (n,) agree with a similarity, as they must to be tied."""
+    """Tell which photos (n,) agree with a similarity well enough to be tied."""
     return _agreeing([_View(seen, forward=True) for seen in photos], there_from_here, _AGREES)
 
 
 def contradicting(photos: Sequence[Seen], there_from_here: Similarity) -> NDArray[np.bool_]:
-    """Tell which photos (n,) cannot have been where a similarity puts them.
+    """Tell which photos (n,) cannot have been taken where a similarity puts them.
 
-    Some that agree with it badly do not contradict it: poses of photos are not exact. Those of
-    redkitchen come to 2.4 times the error of an inlier.
+    The limit is wider than that of ``agreeing``, because poses of photos are not exact. Those of
+    redkitchen reach 2.4 times the largest error of an inlier.
     """
     return ~_agreeing([_View(seen, forward=True) for seen in photos], there_from_here, _COARSE)
 
 
 def too_few(tied: NDArray[np.bool_]) -> str | None:
-    """Say why photos (n,) of which these agree are no tie, in words to follow "but"; or None."""
+    """Say why too few photos agree, as a clause that follows "but"; None if enough do."""
     if tied.sum() >= max(MIN_PHOTOS, len(tied) // 2 + 1):
         return None
     return (
@@ -209,16 +210,16 @@ def refined_on_points(
     *,
     rigid: bool,
 ) -> Similarity:
-    """Refine a similarity on points whose place is known in both frames.
+    """Refine a similarity on points that are known in both frames.
 
-    Projections tell little of a shift that a turn can pass for, and inherit what is wrong with a
-    camera's intrinsics; points that depth gave in both frames do neither. The loss is Cauchy's, in
-    units of the median distance, so that it fits any depth sensor and any unit.
+    Projections hardly tell a small shift from a small turn, and they inherit the errors of the
+    camera's intrinsics. Points from depth in both frames have neither weakness. The loss is
+    Cauchy's, in units of the median distance, so that it fits any depth sensor and any unit.
 
     Args:
         start: near the result.
         here: (n, 3) in this frame, n >= 3.
-        there: (n, 3) the same points in the other, some of them wrong.
+        there: (n, 3) the same points in the other frame; some may be wrong.
         rigid: whether both frames have one unit.
     """
     similarity = start
@@ -241,7 +242,7 @@ def _fitted(
     *,
     rigid: bool,
 ) -> Similarity:
-    """The similarity of the least weighted squares (Umeyama 1991)."""
+    """Return the similarity with the least weighted squares (Umeyama 1991)."""
     weights = weights / weights.sum()
     middle, middle_there = weights @ here, weights @ there
     source, target = here - middle, there - middle_there
@@ -254,7 +255,7 @@ def _fitted(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _View:
-    """A photo with what it sees in the other frame: there, or here if it goes back."""
+    """A photo, and whether it was localized there (``forward``) or, the other way, here."""
 
     seen: Seen
     forward: bool
@@ -269,25 +270,25 @@ class _View:
         return _View(thin, self.forward)
 
     def estimate(self) -> tuple[Pose, Pose]:
-        """The photo's pose in this frame and in the other."""
+        """Return the photo's pose in this frame and in the other."""
         seen = self.seen
         own, other = seen.pose_here, seen.pose_there
         return (own, other) if self.forward else (other, own)
 
     def errors(self, there_from_here: Similarity) -> NDArray[np.float64]:
-        """(n, 2) pixels, projected less seen; NaN behind the camera."""
+        """Return (n, 2) pixels, projected minus observed; NaN behind the camera."""
         other_from_own = there_from_here if self.forward else there_from_here.inverse()
         cam_from_other = other_from_own.move(self.seen.pose_here)
         in_cam = cam_from_other.apply(self.seen.points)
         return np.asarray(project(self.seen.camera, in_cam) - self.seen.pixels)
 
     def median_error(self, there_from_here: Similarity) -> float:
-        """Pixels; those behind the camera are infinitely far off."""
+        """Return the median error in pixels; a point behind the camera counts as infinity."""
         x, y = self.errors(there_from_here).T
         return float(np.median(np.nan_to_num(np.hypot(x, y), nan=np.inf)))
 
     def depth_factors(self, there_from_here: Similarity) -> NDArray[np.float64]:
-        """(n,) how many times further away points are here than there, in one unit."""
+        """Return (n,) each point's distance here divided by that there, in one unit."""
         own, other = self.seen.own_points, self.seen.points
         assert own is not None
         away = np.linalg.norm(self.seen.pose_here.apply(own), axis=1)
@@ -302,7 +303,7 @@ class _View:
 
 
 def _other_depth(views: Sequence[_View], similarity: Similarity) -> str | None:
-    # Places alone would not show another unit: moving all photos back makes up for much of it.
+    # Camera positions alone would not show another unit: moving all photos back hides much of it.
     factor = float(np.median(np.concatenate([view.depth_factors(similarity) for view in views])))
     if abs(factor - 1) <= MAX_DEPTH_OFF:
         return None
@@ -318,14 +319,14 @@ def _refined_by_depth(views: Sequence[_View], start: Similarity, *, rigid: bool)
 
 
 def _points(view: _View) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the points (n, 3) that a photo sees, in this frame and in the other, by depth."""
+    """Return the points (n, 3) that a photo sees, in this frame and in the other."""
     own, other = view.seen.own_points, view.seen.points
     assert own is not None
     return (own, other) if view.forward else (other, own)
 
 
 def _proposed(views: Sequence[_View], *, rigid: bool, seed: int) -> Similarity:
-    """Return the similarity of two photos that most photos agree with; ties go by errors."""
+    """Return the best pair's similarity: most photos agree; of equals, the smallest errors."""
     random = np.random.default_rng(seed)
     judging = [view.thinned(_JUDGING) for view in views]
     limits = np.array([_COARSE * view.max_error_px for view in judging])
@@ -352,7 +353,7 @@ def _aligned(views: Sequence[_View], *, rigid: bool) -> Similarity:
 
 
 def _agreeing(views: Sequence[_View], similarity: Similarity, times: float) -> NDArray[np.bool_]:
-    """Photos half of whose matches are within so many times the error of an inlier."""
+    """Tell which photos have a median error of at most ``times`` the largest error of an inlier."""
     return np.array(
         [view.median_error(similarity) <= times * view.max_error_px for view in views], np.bool_
     )
@@ -361,7 +362,7 @@ def _agreeing(views: Sequence[_View], similarity: Similarity, times: float) -> N
 def _refined(views: Sequence[_View], start: Similarity, *, rigid: bool) -> Similarity:
     """Minimize a robust reprojection error over all matches of photos.
 
-    Rotations and scale are about the middle of the photos, whatever the frames count from.
+    Rotation and scale are about the middle of the photos, so that a far origin does no harm.
     """
     thin = [view.thinned(_REFINING) for view in views]
     middle = np.mean([view.estimate()[0].center for view in views], axis=0)
@@ -373,16 +374,16 @@ def _refined(views: Sequence[_View], start: Similarity, *, rigid: bool) -> Simil
         shift = middle_there + start.scale * size * step[3:6] - scale * rotation @ middle
         return Similarity(scale, rotation, shift)
 
-    # Steps of the translation are in units of how far away the points are, as those of the others.
+    # In units of the distance to the points, all steps move projections about equally.
     size = _distance(views) / start.scale
 
     def errors(step: NDArray[np.float64]) -> NDArray[np.float64]:
         similarity = changed(step)
         found = [view.errors(similarity) / view.max_error_px for view in thin]
-        # Behind the camera, or far off: all the same, so that they pull nowhere.
+        # Points behind the camera or far off have a constant error, so that they pull nowhere.
         return np.nan_to_num(np.concatenate(found), nan=_COARSE).clip(-_COARSE, _COARSE).ravel()
 
-    # The loss of a pose, in units of its largest error.
+    # The scale of the loss that poses are refined with, in units of the largest error of an inlier.
     full = registration_for(LocalizeOptions(), [replace(views[0].seen.camera, width=10**6)])
     solved = least_squares(
         errors,
@@ -398,7 +399,7 @@ def _refined(views: Sequence[_View], start: Similarity, *, rigid: bool) -> Simil
 
 
 def _distance(views: Sequence[_View]) -> float:
-    """Median distance, in the other frame's unit, from photos to what they see there."""
+    """Return the median distance from the photos to their points, in the other frame's unit."""
     far = [
         np.median(np.linalg.norm(view.seen.points - view.seen.pose_there.center, axis=1))
         for view in views
@@ -408,7 +409,7 @@ def _distance(views: Sequence[_View]) -> float:
 
 
 def _errors(photos: Sequence[Seen], similarity: Similarity) -> NDArray[np.float64]:
-    """(2, n) distances and angles between where photos were localized and where they are put."""
+    """Return (2, n) distances and angles between the moved and the localized poses."""
     errors = [pose_error(similarity.move(seen.pose_here), seen.pose_there) for seen in photos]
     return np.array(errors).T
 
@@ -416,7 +417,7 @@ def _errors(photos: Sequence[Seen], similarity: Similarity) -> NDArray[np.float6
 def _scale_error(
     photos: Sequence[Seen], tied: NDArray[np.bool_], distances: NDArray[np.float64]
 ) -> float:
-    """Half of the 95 % interval of the scale that tied photos tell, as a part of it."""
+    """Return half the 95 % interval of the scale that tied photos tell, relative to the scale."""
     centers = np.array(
         [seen.pose_there.center for seen, use in zip(photos, tied, strict=True) if use]
     )
@@ -426,7 +427,7 @@ def _scale_error(
 
 
 def _other_unit(photos: Sequence[Seen], tied: NDArray[np.bool_], free: Similarity) -> str | None:
-    """Why frames have not one unit, by the similarity that fits best; None when they may."""
+    """Say why the frames do not have one unit, by the best similarity; None if they may."""
     allowed = max(_MAX_OTHER_UNIT, _scale_error(photos, tied, _errors(photos, free)[0]))
     if abs(np.log(free.scale)) <= allowed:
         return None
@@ -439,7 +440,7 @@ def _other_unit(photos: Sequence[Seen], tied: NDArray[np.bool_], free: Similarit
 def _scale_doubt(
     photos: Sequence[Seen], tied: NDArray[np.bool_], distances: NDArray[np.float64]
 ) -> str | None:
-    """Why the photos do not tell the scale, if they do not."""
+    """Say why the photos do not tell the scale; None if they do."""
     error = _scale_error(photos, tied, distances)
     if error <= MAX_SCALE_ERROR:
         return None

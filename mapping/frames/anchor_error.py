@@ -72,5 +72,5 @@ def place_error(
 
 
 def _variance(squares: NDArray[np.float64], freedom: NDArray[np.float64]) -> float:
-    """That of Student's t, whose scale is estimated with so many degrees of freedom."""
+    """Return the variance of Student's t with so many degrees of freedom for its scale."""
     return float(squares.sum() / (freedom.sum() - 2))

@@ -51,7 +51,7 @@ def _untold(_stage: str, _done: int, _total: int) -> None:
 
 @dataclass(frozen=True, slots=True)
 class ImportSummary:
-    """What an import brought.
+    """The result of an import.
 
     Attributes:
         images: photos.

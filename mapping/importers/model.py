@@ -1,4 +1,4 @@
-"""What every importer makes of a foreign reconstruction."""
+"""The common model that every importer makes of another tool's reconstruction."""
 
 from __future__ import annotations
 

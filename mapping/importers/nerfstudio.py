@@ -35,7 +35,7 @@ _NAMED = 3
 
 @dataclass(slots=True)
 class _Seen:
-    """What frames have in common, gathered on the way."""
+    """Values that frames share, gathered while they are read."""
 
     sensors: dict[str, Sensor] = field(default_factory=dict)
     cameras: dict[tuple[Camera, tuple[int, int] | None], str] = field(default_factory=dict)

@@ -37,7 +37,7 @@ _MIN_FOCAL = 1e-3  # pixels; powers of what is below overflow in 1 / f
 
 @dataclass(frozen=True, slots=True)
 class _Calibration:
-    """What ``FixedK fx cx fy cy`` in the first line says of all cameras, in pixels."""
+    """The camera that ``FixedK fx cx fy cy`` in the first line gives for all photos, in pixels."""
 
     fx: float
     cx: float

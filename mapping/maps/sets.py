@@ -52,7 +52,7 @@ from visloc.sets.coarse import (
     descriptors_of,
 )
 
-# Metric maps of one set have one unit, as far as a fit to positions can tell.
+# Largest difference of scale between metric maps of one set: as well as fits to positions tell it.
 _MAX_SCALE_DIFFERENCE = 0.02
 # The down directions of two maps, rotated into the set's frame, differ by at most this.
 _MAX_DOWN_DIFFERENCE = math.radians(5.0)
@@ -95,9 +95,12 @@ def publish_set(
 ) -> Path:
     """Publish a set of maps of a store as the current version of a set.
 
-    The set is metric when its metric maps keep their unit; of maps that are not, when its frame is
-    tied to the Earth with a metre as its unit. It knows down when all of its maps do, and where it
-    lies on Earth when one of them does: the first tells.
+    What the set knows of its frame:
+
+    - It is metric if its metric maps keep their unit. Without metric maps, it is metric if its
+      frame is tied to the Earth with a metre as its unit.
+    - It knows down if all of its maps do.
+    - It knows where it lies on Earth if one of its maps does. The first of these counts.
 
     Args:
         store: holds the maps.
@@ -279,7 +282,7 @@ def _world(placed: Sequence[_Placed]) -> SetWorld:
 
 
 def _refuse_other_place(placed: Sequence[_Placed], geodetic: Geodetic) -> None:
-    """Refuse maps whose own anchors put their photos elsewhere on Earth than that of the set."""
+    """Refuse maps whose anchors put their photos elsewhere on Earth than the set's does."""
     for one in placed:
         own = None if one.anchor is None else one.anchor.geodetic
         if own is None:

@@ -1,12 +1,14 @@
-"""Photos of a finished model that contradict each other: what gives a wrong loop closure away.
+"""Find photos of a finished model that contradict each other, as a wrong loop closure makes them.
 
-Two places that look alike may be joined to one: both hallways then stand in the same space, and
-photos of both seem to be taken beside each other. Every landmark that a photo should show, by its
-pose, is looked for in it. Photos of one hallway find the same landmarks and miss the same ones:
-those of the other hallway. Of two photos from different hallways, one misses what the other finds.
-So what they find is correlated between photos of one place, and the other way round between photos
-of two. In a model of one place, photos taken near each other miss landmarks independently: by
-chance, or because something stands in front.
+Two hallways that look alike may be joined to one. Then both stand in the same space, and photos of
+both seem to be taken beside each other. Here each photo is searched for the landmarks that it
+should show by its pose. What two neighbouring photos find is then
+
+- positively correlated, if both show the same hallway: both find its landmarks, and miss those of
+  the other hallway;
+- negatively correlated, if they show different hallways: one finds what the other misses;
+- independent in a model of one place, where landmarks are missed by chance, or because something
+  stands in front.
 
 The photos are grouped by these correlations, by greedy additive edge contraction (Keuper et al.,
 "Efficient decomposition of image and mesh graphs by lifted multicuts", 2015).
@@ -30,25 +32,25 @@ from visloc.pose.distance import viewpoints_apart
 # Photos near one, by ``viewpoints_apart`` (radians). What they observe it should show, and it is
 # compared with them.
 _MOST_NEAR, _NEAR = 30, 0.7
-# A landmark is expected to look alike from up to this angle and ratio of distances apart.
+# A landmark should look the same within this angle, and this ratio of distances.
 _LEAST_COSINE, _MOST_OCTAVES = np.cos(np.radians(20.0)), 0.7
-# Landmarks that so many photos observe. Two of them alone would always agree.
+# Only landmarks that so many photos observe are used. Two photos alone would always agree.
 _LEAST_TRACK = 3
-# Landmarks of a photo that are looked for in others, in the mean: the same ones for all photos.
+# Mean number of a photo's landmarks that are searched for in others: the same for all others.
 _LOOKED_FOR = 400
 # Landmarks stand in front if their depth is less than this part of another's, and these nearest
 # ones lie within this part of the longer side.
 _IN_FRONT, _NUM_BESIDE, _BESIDE = 0.75, 3, 0.03
-# The keypoint that shows a landmark lies about there, by this part of the longer side: poses that
-# are a little off are not two places.
+# A keypoint shows a landmark if it is expected within this share of the longer side. The share is
+# generous, because slightly wrong poses are not two places.
 _ABOUT = 0.015
-# Two photos are compared by so many landmarks, and weigh no more with more of them.
+# Fewest landmarks that two photos are compared by; more than the second number weigh no more.
 _LEAST_COMPARED, _FULL_WEIGHT = 40, 300
-# Photos of one place may be correlated a little the other way round. Measured:
+# Photos of one place may have a slightly negative correlation. Measured:
 # docs/decisions/0037-places-that-contradict.md.
 _SLACK = 0.05
-# Groups of so many photos show two places when so many pairs across them or more are correlated by
-# this or less in the mean, and pairs within them by so much more.
+# Two groups of at least so many photos show two places if at least so many pairs across them have a
+# mean correlation of at most this, and pairs within the groups one that is so much larger.
 _LEAST_PHOTOS = 3
 _LEAST_PAIRS, _CONTRADICT, _LEAST_CONTRAST = 4, -0.07, 0.25
 # A pair with such a correlation shows one place, whatever its groups say.

@@ -1,11 +1,11 @@
 """Photos that incremental mapping left out, placed in the finished model.
 
-The mapper places photos by pairs that are believed (``mapping.methods.look_alikes``), before it is
-known what a photo should show. With a finished model that is known. So here any verified pair may
-propose a pose, and the photo itself decides: it must show what photos near that pose observe. In
-the poses that another floor of one design proposes, a photo shows one landmark in ten.
+The mapper uses believed pairs only (``mapping.methods.look_alikes``), because it cannot know yet
+what a photo should show. A finished model knows. So here any verified pair may propose a pose, and
+the photo itself decides: it must show what photos near that pose observe. If another floor of the
+same design proposes the pose, the photo shows one landmark in ten.
 
-Photos in the model stay where they are.
+Photos that are in the model already stay where they are.
 """
 
 from __future__ import annotations
@@ -27,17 +27,19 @@ from visloc.pose.colmap import normalized_rays, project
 from visloc.pose.generalized import GeneralizedPose, estimate_generalized_pose
 from visloc.pose.views import MatchedView
 
-# Matches with photos at most so many steps away in time are tried alone first: what repeats itself
-# within a place matches photos of another part of it.
+# Matches with photos at most so many steps away in time are tried alone first, because repeated
+# things also match photos of other parts of the place.
 _NEAR_STEPS = 6
-# In right poses, photos show 0.54 to 0.93 of what they should; in another part of the place, and on
-# another floor, 0.12 at most. Measured: docs/decisions/0037-places-that-contradict.md.
+# Least share of landmarks that a photo must show. Right poses have 0.54 to 0.93; poses in another
+# part of the place, or on another floor, 0.12 at most (measured:
+# docs/decisions/0037-places-that-contradict.md).
 _LEAST_SHOWN = 0.5
-# Fewer landmarks tell nothing.
+# Fewer landmarks do not tell.
 _LEAST_EXPECTED = 20
-# Inliers of a pose that is worth a look. As many as the mapper asks for must be inliers or shown.
+# A pose with fewer inliers is not looked at. In the end, as many landmarks as the mapper asks for
+# must be inliers, or shown.
 _LEAST_PROPOSING = 20
-# Pairs that were not believed make landmarks where so many of their matches fit the poses.
+# Pairs that were not believed make landmarks if this share of their matches fits the poses.
 _LEAST_FITTING = 0.5
 
 
@@ -76,7 +78,7 @@ def place_latecomers(
     config: MapperConfig,
     progress: ItemProgress,
 ) -> Late:
-    """Place photos that have none in a model by what it shows of them, one after another.
+    """Place photos without a pose in a finished model, one after another.
 
     A photo that is placed adds the landmarks that it shares with others, so the next may find a
     place by it. Photos of cameras that the model does not know, or that are in doubt, are left out.
@@ -214,8 +216,7 @@ class _Growing:
         """Give a photo its pose, and make landmarks of what it shares with others.
 
         Returns:
-            False when no pair fits the pose, so that the photo would see no landmark: then it has
-            no place.
+            False if no pair fits the pose. Then the photo would see no landmark, and gets no pose.
         """
         camera = self._cameras[self._photos[row].sensor]
         view = self.views[row] = View(camera, proposed.pose.rig_from_world)
@@ -245,7 +246,7 @@ class _Growing:
         return True
 
     def fitting(self, rows: Collection[int]) -> list[Matches]:
-        """Return the matches of pairs of some photos that fit the poses, of pairs that do."""
+        """Return the matches that fit the poses, of those pairs of some photos that fit them."""
         found = []
         for row in rows:
             for other, matched in self._pairs[row].items():

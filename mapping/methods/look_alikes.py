@@ -1,17 +1,19 @@
-"""Which verified pairs of photos show one place, and which show two places that look alike.
+"""Tell pairs of photos that show one place from pairs that show two places that look alike.
 
 Photos of two hallways of one design have hundreds of matches that fit one geometry: the doors, the
-lamps, the ceiling. What gives them away are the matches that are missing (Zach, Irschara and
-Bischof, "What can missing correspondences tell us about 3D structure and motion?", 2008). A
-keypoint that other photos of its place confirm should be found again in every photo that shows the
-place from nearby: in another hallway the pictures, the numbers and the furniture are not.
+lamps, the ceiling. The missing matches give them away (Zach, Irschara and Bischof, "What can
+missing correspondences tell us about 3D structure and motion?", 2008). A keypoint that other
+photos of its place confirm should be found again in every photo that shows the place from nearby.
+In another hallway the pictures, the numbers and the furniture are not found.
 
-Between photos of one place that share is low too, if they are taken far apart. In order of time,
-photos next to each other are likely to show one place, and need less. Any other pair with a low
-share is believed where third photos agree with it: their own pairs lead from its keypoints to
-those that it matches them with. So a third photo never links places that no believed pair links;
-and what repeats itself within one place does not pass, as over a third photo the first door in a
-row does not lead to the second.
+The share of confirmed keypoints that are found is also low between photos of one place that were
+taken far apart. So there are two exceptions:
+
+- Photos next to each other in time probably show one place, and need a smaller share.
+- Any other pair is believed if third photos agree with it: believed pairs lead from its keypoints,
+  over a third photo, to those that it matches them with. A third photo never links places that no
+  believed pair links. Nor does it pass repetitions within a place: over a third photo, the first
+  door in a row does not lead to the second.
 """
 
 from __future__ import annotations
@@ -35,7 +37,7 @@ _NEAR_STEPS = 3
 _LEAST_NEAR, _LEAST_FAR = 0.1, 0.3
 # Fewest matches of a pair that third photos must agree with.
 _MIN_AGREEING = 15
-# Fewer confirmed keypoints than that tell nothing.
+# Fewer confirmed keypoints do not tell.
 _MIN_EXPECTED = 20
 _FIT_ROUNDS = 5
 _FIT_SCALE_PX = 2.0
@@ -48,7 +50,7 @@ _MAX_FITTED = 200
 def without_look_alikes(
     photos: Sequence[SfmPhoto], matches: Sequence[Matches], progress: ItemProgress = not_told
 ) -> list[Matches]:
-    """Return the pairs that are not contradicted by matches that are missing.
+    """Return the pairs that no missing matches contradict.
 
     Args:
         photos: in any order; those of one sensor are put in order of time.
@@ -88,7 +90,8 @@ class _Links:
     def agree_with(self, pair: Matches) -> bool:
         """Tell whether third photos link the keypoints that a pair matches, and to no others.
 
-        More keypoints must be linked as the pair matches them than otherwise.
+        Of the keypoints that third photos link, more than half must be linked as the pair matches
+        them.
         """
         first, second = self._rows[pair.first], self._rows[pair.second]
         agrees = np.zeros(len(pair.rows), dtype=bool)
@@ -159,8 +162,8 @@ def _share_found(photos: Sequence[SfmPhoto], confirmed: _Confirmed, pair: Matche
 def _affine_fit(ours: NDArray[np.float64], theirs: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the affine map (3, 2) that takes matched pixels (n, 2) to each other.
 
-    Roughly, as depths differ: it only tells which part of a photo the other shows. The sum of the
-    errors is minimized, not of their squares, by reweighting.
+    It is rough, because depths differ: it only tells which part of a photo the other shows. The sum
+    of the errors is minimized by reweighting, not the sum of their squares.
     """
     design = _with_one(ours)
     weights = np.ones(len(ours))

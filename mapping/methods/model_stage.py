@@ -117,7 +117,7 @@ def believed_pairs(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Inputs:
-    """What a worker needs for a stage of the whole map."""
+    """The input of a worker for a stage of the whole map."""
 
     work: WorkFolder
     photos: tuple[MappingPhoto, ...]

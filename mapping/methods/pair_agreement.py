@@ -1,10 +1,10 @@
-"""Whether the poses of a finished model agree with the matches that they were made of.
+"""Tell whether the poses of a finished model agree with the matches that they were made of.
 
-The verified matches of a pair fit one geometry of its two photos. In a sound model, that geometry
-is the one of their poses, and nearly all matches fit it. Where something moves through the
-pictures and has more matches than the place in some of the pairs, the geometry of these pairs is
-that of the moving thing: no poses fit them and the others together. The mapper then leaves out what
-does not fit, and the model looks consistent: so the pairs are asked, not the landmarks.
+The verified matches of a pair fit one geometry of its two photos. In a sound model, that is the
+geometry of their poses, and nearly all matches fit it. If something moves through the pictures, it
+may have more matches than the place in some pairs. The geometry of these pairs is then that of the
+moving thing, and no poses fit all pairs. The mapper leaves out the matches that do not fit, so the
+landmarks look consistent. That is why the pairs are compared, not the landmarks.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from visloc.archive.schema import Doubt
 
 # Poses contradict a pair when less than this part of its matches fits them.
 _LEAST_FITTING = 0.4
-# A match fits within so much of the longer side, or the pixels within which it was verified:
-# poses that are a little off do not contradict it.
+# A match fits within this share of the longer side, or within the pixels that it was verified by,
+# whichever is more: slightly wrong poses do not contradict it.
 _ABOUT = 0.01
-# A model is in doubt when so many pairs and a larger part of them than this contradict its poses.
+# A model is in doubt when at least so many pairs, and more than this share, contradict its poses.
 # Measured: docs/decisions/0040-moving-things.md.
 _LEAST_PAIRS, _MOST_CONTRADICTED = 4, 0.03
 _MAX_NAMES = 100

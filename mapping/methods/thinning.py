@@ -1,7 +1,7 @@
 """Fewer keypoints to find poses with, spread over each photo.
 
-Thousands of keypoints of a photo make good landmarks, and its pose no better than a thousand: the
-adjustments, most of the time of incremental mapping, take as many times as long.
+Thousands of keypoints make good landmarks, but a thousand find a photo's pose as well. Adjustments
+take most of the time of incremental mapping, and their time grows with the keypoints.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from visloc.geometry import Camera
 # Keypoints that take part: of all photos together, and of each at least. Adjusting few photos takes
 # little time with all that they have, and each of their links counts.
 ALL, MOST = 100_000, 1000
-# Pairs with so few matches keep all: they may be all that places a photo. A pair that is left with
-# few of many gets none back: what its photos share with no third is more often wrong.
+# Pairs with so few matches keep all, because a photo's pose may depend on them. A pair that keeps
+# few of many matches gets none back: matches that no third photo shares are more often wrong.
 FEW = 200
 # The longer side of a photo is divided into so many cells, which have equal parts of them.
 _CELLS = 8

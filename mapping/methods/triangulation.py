@@ -34,8 +34,8 @@ from visloc.errors import VislocError, refuse
 # Stages of a build.
 LOOK_ALIKES, MAPPING = "look-alike pairs", "incremental mapping"
 ADJUSTMENT, TRIANGULATION = "adjustment", "triangulation"
-# Least angle between the rays of the two photos that the mapper begins with, in the median. With
-# COLMAP's 16 degrees they may be far apart and share few matches; what they make places others.
+# Least median angle between the rays of the two photos that the mapper begins with. With COLMAP's
+# 16 degrees they may be far apart and share few matches, and their errors spread to other photos.
 _FIRST_ANGLE_DEG = 4.0
 # All photos are adjusted together when the model has grown by this factor. With COLMAP's 1.1, twice
 # as many times: poses of the painted room and of castle were as good.

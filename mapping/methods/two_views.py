@@ -1,4 +1,4 @@
-"""Matches that fit one geometry of two photos, and whether so many could do so by chance."""
+"""Find the matches that fit one geometry of two photos, and judge whether so many fit by chance."""
 
 from __future__ import annotations
 
@@ -192,7 +192,7 @@ def log10_chance(num_matches: int, num_inliers: int, share: float, *, calibrated
     and all sets of so many matches.
 
     Args:
-        share: of the photo that lies as near to a line as an inlier.
+        share: part of the photo that lies as near to an epipolar line as an inlier must.
     """
     sample = _SAMPLE[calibrated]
     if num_inliers <= sample:

@@ -18,7 +18,7 @@ from mapping.progress import Progress
 from mapping.stages.landmarks import rows_by_value
 from visloc.errors import InvalidInput
 
-# Models that are made: what is wrong after the last stays, and the map's own test tells.
+# At most so many models are made. Errors of the last one stay, and the map's own test reports them.
 _MOST_MODELS = 4
 
 
@@ -32,7 +32,7 @@ def reconstruct_places(
     work: Path,
     progress: Progress,
 ) -> SparseModel:
-    """Reconstruct, and again without the pairs of photos that the model shows to be of two places.
+    """Reconstruct, then repeat it without the pairs of photos that the model shows to be wrong.
 
     Arguments and errors are those of ``reconstruct``.
 

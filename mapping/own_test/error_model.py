@@ -1,4 +1,4 @@
-"""How much further poses are off than their photos tell, learned from poses that are known."""
+"""Learn from known poses by how much poses are further off than their photos tell."""
 
 from __future__ import annotations
 
@@ -11,11 +11,10 @@ from scipy.special import chdtri, fdtri
 from visloc.archive.schema import MAX_FACTOR
 
 _DIMENSIONS = 3
-# Of Student's t. Among held-out mapping photos errors scatter nearly like a normal distribution
-# around what a map adds; eight degrees of freedom leave room for some that do not.
+# Degrees of freedom of Student's t. Errors of held-out mapping photos are nearly normal; eight
+# degrees of freedom leave room for some outliers.
 _FREEDOM = 8
-# Before a map has said anything: about what six maps had in the median, and the weight of that in
-# photos.
+# The prior of the factor: about the median of six maps, and its weight as a number of photos.
 _PRIOR_FACTOR, _PRIOR_PHOTOS = 2.0, 8.0
 # A covariance is read with normal quantiles. So that 95 % of such errors lie in the ellipsoid that
 # a normal distribution has for 95 %, it is wider by the ratio of both quantiles.
@@ -39,9 +38,9 @@ def fitted_factor(squares: NDArray[np.float64]) -> float:
     """Fit by how much standard deviations are too small, at least 1.
 
     The scale of a multivariate t distribution by maximum likelihood (Lange, Little and Taylor
-    1989), whose weights hold outliers down: s^2 is a third of the mean of
-    (v + 3) m / (v + m / s^2). A map is believed at once that it is worse than usual maps. That it
-    is better takes photos: then some of a usual map count beside its own.
+    1989), whose weights reduce the effect of outliers: s^2 is a third of the mean of
+    (v + 3) m / (v + m / s^2). A map that is worse than usual is believed at once. A map that seems
+    better is averaged with some photos of a usual map, so it needs many photos to be believed.
 
     Args:
         squares: (n,) squared errors of three dimensions in units of what the photos tell, m.

@@ -70,7 +70,7 @@ def publish_tested(
 ) -> Path:
     """Publish what ``write_content`` wrote; make it current unless there are doubts.
 
-    Doubts of the version that it is based on do not count: somebody put that into use.
+    Doubts that the base version had too do not count, because somebody put that version into use.
     """
     doubts, known = read_manifest(incoming).parts.doubts, tuple[Doubt, ...]()
     if based_on is not None:
@@ -85,8 +85,8 @@ def publish_tested(
 def refuse_not_accepted(store: MapStore, opened: Map) -> None:
     """Refuse to make something of a version in doubt that nobody put into use.
 
-    What is made of it would be put into use: a test of the result does not find all that spoke
-    against the version, as photos that found no place are not in it any more.
+    The result could pass its own test and be put into use, because that test cannot find all
+    doubts: photos that found no place, for one, are not in the version any more.
 
     Raises:
         Conflict: ``map.doubtful``.

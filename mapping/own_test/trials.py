@@ -1,6 +1,6 @@
 """A map's own photos, each localized in the map without itself and its nearest neighbours.
 
-What is learned from them goes into the map (docs/map-format.md), and with it into every answer.
+The errors that this shows are stored in the map (docs/map-format.md) and widen every answer.
 """
 
 from __future__ import annotations
@@ -25,17 +25,18 @@ from visloc.localization.judge import TIE_ANGLE, TIE_REACH_SHARE
 from visloc.localization.viewpoints import Viewpoints
 from visloc.options import LocalizeOptions
 
-# Photos that are tried: so many of a small map, a fifth of a larger one, up to a limit. The test
-# then takes a tenth of a build (docs/decisions/0028-the-maps-own-test.md).
+# How many photos are tried: a fifth of the map, within these limits. The test then takes a tenth of
+# the time of a build (docs/decisions/0028-the-maps-own-test.md).
 _LEAST_PHOTOS, _SHARE_OF_PHOTOS, _MOST_PHOTOS = 12, 5, 60
-# A query stands about so far from the nearest mapping photo, as ``Viewpoints.apart_from`` counts.
+# The usual distance of a query from the nearest mapping photo, by ``Viewpoints.apart_from`` (rad).
 _LEFT_OUT_WITHIN = 0.2
 # Fewer than online, which takes 20: the last ones add little, and each costs as much.
 _PHOTOS_ASKED = 8
-# As many as a query has. Stored photos may have more, which would hide the errors of the map less.
+# As many keypoints as a query has. Stored photos may have more, which would make a trial's own
+# scatter smaller than a query's.
 _MOST_KEYPOINTS = 2500
-# Photos whose poses were estimated together with the landmarks fit them better than a query does:
-# by so much on a painted room that was built with its exact poses and without
+# Photos whose poses were estimated together with the landmarks fit them better than a query does.
+# The factor was measured on a painted room, built with its exact poses and without
 # (docs/decisions/0028-the-maps-own-test.md).
 _FLATTERED = 1.5
 
@@ -45,7 +46,7 @@ class Trial:
     """One photo, localized.
 
     Attributes:
-        error: (6,) rotation (rad) then centre, in the camera's axes, estimated less true.
+        error: (6,) rotation (rad) then centre, in the camera's axes, estimated minus true.
         photo_covariance: (6, 6) of it, as far as the photo's own measurements tell.
         score: what spoke for the pose.
     """
@@ -108,8 +109,8 @@ def run_own_test(opened: Map, progress: ItemProgress = not_told) -> OwnTestRun:
 def learned(trials: Sequence[Trial], tested: int, reach: float, *, independent: bool) -> OwnTest:
     """Learn the errors of a map from its trials.
 
-    A pose at another place, by more than a tenth of how far the photos see or five degrees, counts
-    as wrong. The factors are of the right ones.
+    A pose that is off by more than a tenth of the photos' reach, or by five degrees, is at another
+    place and counts as wrong. The factors are learned from the others.
 
     Args:
         trials: photos that were localized.
@@ -147,7 +148,7 @@ def _factor(
     factor = fitted_factor(mahalanobis2(errors, covariances))
     if not independent:
         factor = min(_FLATTERED * factor, MAX_FACTOR)
-    # Two digits, so that last bits, which differ between machines, make no other map.
+    # Two digits, so that last bits, which differ between machines, do not change the map.
     return round(factor, 2)
 
 

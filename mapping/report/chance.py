@@ -35,7 +35,7 @@ _MEDIAN_LENGTH = 0.888
 
 @dataclass(frozen=True, slots=True)
 class Outlook:
-    """What a photo can expect at a pose.
+    """The chance of a photo at a pose.
 
     Attributes:
         expected_inliers: correct matches.

@@ -141,7 +141,7 @@ def decimals_of(step: float) -> int:
 
 
 def _doubts(runs: Sequence[HeldOut], within: Within) -> list[str]:
-    """What the reader must know before trusting the predictions."""
+    """Warnings to read before trusting the predictions."""
     if not runs:
         return [
             "Coverage: no photo could be held out, so that probabilities rest on what holds for "

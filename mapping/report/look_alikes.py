@@ -63,7 +63,7 @@ class LookAlike:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Search:
-    """What asking a map for places that look alike gave.
+    """The result of asking a map for places that look alike.
 
     Attributes:
         found: pairs of places.

@@ -35,7 +35,7 @@ _MEDIAN_OF_RAYLEIGH = 1.1774  # by the standard deviation along each axis
 
 @dataclass(frozen=True, slots=True)
 class Within:
-    """What counts as localized: so near to where the photo was taken.
+    """The distance within which a photo counts as localized.
 
     Attributes:
         position: units of the world.
@@ -55,7 +55,7 @@ class Within:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Forecast:
-    """What is expected of a photo at a pose.
+    """The prediction for a photo at a pose.
 
     Attributes:
         sight: what is in view.
@@ -121,7 +121,7 @@ class _Seen:
 
 
 def tolerance_of(opened: Map, viewpoints: Viewpoints) -> Within:
-    """What counts as localized in a map."""
+    """Return the distances within which photos of a map count as localized."""
     metric = opened.manifest.world.metric
     position = _POSITION_M if metric else _POSITION_OF_REACH * viewpoints.reach
     return Within(position, _ORIENTATION_DEG)

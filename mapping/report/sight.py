@@ -1,4 +1,4 @@
-"""What a photo taken somewhere would have in view of the map, and from where that is known."""
+"""Predict which landmarks a photo taken somewhere would see, and from which mapping photos."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Sight:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Absent:
-    """What is to be thought away from a map.
+    """The part of a map to leave out.
 
     Attributes:
         photos: (k,) int64 rows.

@@ -106,7 +106,7 @@ def _usually_in_view(model: CoverageModel, plan: Plan) -> float:
 def _why(
     forecast: Forecast, plan: Plan, model: CoverageModel, usual: float, within: Within, unit: str
 ) -> str:
-    """What is wrong with what is in view, in words."""
+    """Say in words why the view is weak."""
     sight, outlook = forecast.sight, forecast.outlook
     in_view = round(len(sight) / model.places.share)
     if in_view == 0:

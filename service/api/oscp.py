@@ -1,4 +1,4 @@
-"""What the OSCP GeoPose protocol asks and answers, versions 1 and 2.
+"""Requests and answers of the OSCP GeoPose protocol, versions 1 and 2.
 
 Clients differ in how they spell it, so reading is lenient: unknown fields are passed over, null is
 absent, the version is told by the shape of ``sensorReadings``. Writing is strict.

@@ -1,4 +1,4 @@
-"""What all gRPC methods share: answers as messages, errors as statuses, the log."""
+"""The envelope of all gRPC methods: answers as messages, errors as statuses, the log."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ NAME_RULE = "1 to 64 letters, digits, '.', '_', '@' and '-', beginning with lett
 
 
 class Scope(StrEnum):
-    """What a key allows. No scope contains another."""
+    """The rights that a key may have. No scope contains another."""
 
     LOCALIZE = "localize"
     READ = "read"

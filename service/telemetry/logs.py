@@ -27,7 +27,7 @@ UNMATCHED = "unmatched"
 
 @dataclass(slots=True)
 class RequestRecord:
-    """What is known of a request so far; logged when it ends.
+    """The facts about a request, gathered as it proceeds and logged when it ends.
 
     Attributes:
         door: ``http`` or ``grpc``.

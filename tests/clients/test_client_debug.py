@@ -63,7 +63,7 @@ def test_matches_are_not_asked_for_unless_wanted(url: str, photo: Path, service:
 
 
 def test_the_command_writes_the_picture_localized_or_not(
-    url: str, photo: Path, tmp_path: Path
+    url: str, photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for content, code in ((b"photo", 0), (b"refuse", 3)):
         photo.write_bytes(content)
@@ -73,6 +73,7 @@ def test_the_command_writes_the_picture_localized_or_not(
 
         assert found == code
         assert picture.read_bytes() == bytes(range(256))
+        assert picture.name in "".join(capsys.readouterr().out.split())
 
 
 def test_a_picture_that_cannot_be_written_is_found_before_the_server_is_asked(

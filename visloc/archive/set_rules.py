@@ -1,4 +1,4 @@
-"""What a store refuses so that a set and its tiles stay consistent."""
+"""Rules that keep a set and its tiles consistent."""
 
 from __future__ import annotations
 

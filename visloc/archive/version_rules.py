@@ -1,4 +1,4 @@
-"""What a store refuses so that names and versions stay unambiguous."""
+"""Rules that keep names and versions of a store unambiguous."""
 
 from __future__ import annotations
 

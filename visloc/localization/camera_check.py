@@ -24,22 +24,22 @@ from visloc.pose.intrinsics import (
 from visloc.pose.views import MatchedView
 from visloc.types import CameraSource
 
-# Standard deviation of what a right camera is off by: of the focal length and of fx / fy. A
+# Relative error (standard deviation) of a correct camera: of its focal length, and of fx / fy. A
 # calibration is good to one per cent, EXIF hardly better.
 _CAMERA_STD = 0.01
-# Of the principal point, in longer sides. A turn of the camera hides a shift of it, so that a map
-# that is slightly bent moves it by a tenth. Crops off the centre move it by more.
+# The same of the principal point, in longer sides. A turn of the camera looks like a shift of the
+# principal point. So a slightly bent map moves it by a tenth; a crop off the centre moves it more.
 _PRINCIPAL_POINT_STD = 0.04
-_ESTIMATED_FOCAL_STD = 1.0  # it is what the matches say already
-# Sensors are read row by row, within 1/30 s: a camera that tilts by one radian per second meanwhile
-# stretches its rows apart by 3 %, and fy with them.
+_ESTIMATED_FOCAL_STD = 1.0  # the matches have decided it already
+# Sensors are read row by row, within 1/30 s. A camera that tilts by one radian per second meanwhile
+# stretches the picture by 3 % across its rows, and fy with it.
 _SHUTTER_STD = 0.03
-# A contradiction lies beyond so many standard deviations, and the photo must fit the camera found
-# better than the one given: two standard deviations for the focal length alone. With the principal
-# point and fx / fy there is more freedom to fit wrong matches.
+# A contradiction needs two things: the intrinsics found are so many standard deviations away, and
+# they fit better by so much (chi-square). The limits for the focal length alone are lower: with the
+# principal point and fx / fy there is more freedom to fit wrong matches.
 _MAX_DEVIATIONS, _MIN_FOCAL_GAIN = 4.0, 4.0
 _MAX_DEVIATIONS_OF_ALL, _MIN_GAIN = 4.5, 12.0
-# Fewer than that beyond chance say nothing.
+# Fewer inliers beyond those by chance do not tell.
 _MIN_INLIERS = 30
 _SUBJECTS: Mapping[CameraSource, str] = {
     CameraSource.GIVEN: "the given camera",
@@ -54,9 +54,9 @@ _ADVICE: Mapping[CameraSource, str] = {
     CameraSource.EXIF: _SEND_THE_RIGHT_ONE,
     CameraSource.ESTIMATED: _SEND_THE_RIGHT_ONE,
 }
-# Of one part of the intrinsics, to be named as the one that is wrong.
+# Standard deviations beyond which the message names a part of the intrinsics as wrong.
 _NAMED_DEVIATIONS = 3.0
-# A focal length that is wrong by more has a cause.
+# From this factor on the message asks for the cause of a wrong focal length.
 _NOTABLE_FACTOR = 1.15
 
 
@@ -78,7 +78,7 @@ def camera_contradiction(
         reduced: how many pixels of the photo, as it was sent, a side of the view's pixel spans.
 
     Returns:
-        None where they do not, or are too few to tell.
+        None if they do not contradict it, or are too few to tell.
     """
     found = _contradicting(view, source, rig_from_world, max_error_px)
     return None if found is None else _described(view.camera.reduced(1 / reduced), source, found)
@@ -136,7 +136,7 @@ def _focal_std(source: CameraSource) -> float:
 
 
 def _tolerance(source: CameraSource) -> NDArray[np.float64]:
-    """Covariance (4, 4) of what a right camera is off by."""
+    """Return the covariance (4, 4) of the errors of a correct camera."""
     stds = np.full(4, _CAMERA_STD)
     stds[FOCAL] = _focal_std(source)
     stds[[SHIFT_X, SHIFT_Y]] = _PRINCIPAL_POINT_STD
@@ -146,7 +146,7 @@ def _tolerance(source: CameraSource) -> NDArray[np.float64]:
 
 
 def _described(camera: Camera, source: CameraSource, found: FoundIntrinsics) -> str:
-    """What the camera says, what the photo says, and what to do."""
+    """Return a message: the camera's value, the photo's value, and what to do."""
     is_wrong = _wrong_parts(found, source)
     shifted = bool(is_wrong[SHIFT_X] or is_wrong[SHIFT_Y])
     stretched = bool(is_wrong[ASPECT])
@@ -176,7 +176,7 @@ def _described(camera: Camera, source: CameraSource, found: FoundIntrinsics) -> 
 
 
 def _cause(camera: Camera, factor: float, *, shifted: bool, stretched: bool) -> str:
-    """A question about what was done to the photo, or nothing."""
+    """Return a question about the likely cause, such as a crop; empty without a guess."""
     x, y = _principal_point(camera)
     turned = abs(x - camera.height / 2) + abs(y - camera.width / 2) < abs(
         x - camera.width / 2

@@ -1,9 +1,9 @@
-"""Coarse poses: where a photo was taken, told by the photos that look like it alone.
+"""Coarse poses: where a photo was taken, judged only by the mapping photos that look like it.
 
 The pose of the query is interpolated from those of the best retrieved photos (BDI,
 ``visloc.retrieval.interpolation``). No keypoint confirms it, so it is never an answer of status
-``localized``. Its spread is learned from the map: its own photos are approximated without
-themselves and their neighbours, and the errors compared with how far the retrieved photos scatter.
+``localized``. Its spread is learned from the map. Each of its photos is approximated without itself
+and its neighbours, and the errors are compared with the scatter of the retrieved photos.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from visloc.types import CoarseMethod, CoarsePose, Evidence
 METHOD = CoarseMethod.BDI
 NUM_AVERAGED = 3
 NUM_SCATTER = 10
-# Trials: photos of the map, each approximated without so many photos nearest to it, itself
-# included, but never without more than a third of the map.
+# Trials approximate photos of the map. Each leaves out so many photos nearest to it, itself
+# included, but at most a third of the map.
 _MAX_TRIALS = 60
 _LEFT_OUT = (1, 5, 10)
 _LARGEST_SHARE = 3
@@ -71,10 +71,10 @@ class _Widening:
     def learned(errors: _Matrix, scatters: _Matrix) -> _Widening:
         """Learn from trials: errors (n, 3) and scatters (n, 3, 3).
 
-        The ellipsoid of 95 % holds that share of the errors, counted as in conformal prediction:
-        of n errors, the one at ``ceil(0.95 (n + 1))``, or the largest of few.
+        The ellipsoid of 95 % holds that share of the errors, as in conformal prediction: it
+        reaches the error at rank ``ceil(0.95 (n + 1))``, or the largest if there are fewer.
         """
-        # A retrieved photo may stand where the query is not, with all others beside it.
+        # All retrieved photos may stand together where the query was not taken.
         least = max(float(np.median((errors**2).sum(axis=1))) / 3.0, _LEAST_VARIANCE)
         weighed = np.linalg.solve(scatters + least * np.eye(3), errors[:, :, None])[:, :, 0]
         squares = np.sort(np.einsum("ni,ni->n", errors, weighed))
@@ -110,14 +110,14 @@ class CoarsePoses:
             constraints: the priors of the query.
 
         Returns:
-            The pose in the world; None in a map of too few photos to learn a spread from, and
-            where the pose contradicts a prior by more than the spread allows.
+            The pose in the world. None if the map has too few photos to learn a spread from, or if
+            the pose contradicts a prior by more than the spread allows.
         """
         if self._spread is None:
             return None
         found = self._approximated(query, retrieved, fusion)
         turn = turn_of(evidence.exif_orientation) if evidence.read_as is ReadAs.UPRIGHT else 1
-        # The approximated camera was upright; the photo's own is that turned back.
+        # The approximated camera is upright. Turned back, it is that of the photo as stored.
         stored_from_upright = _upright_from_stored(turn, evidence.turned).T
         pose = Pose(
             stored_from_upright @ found.pose.rotation, stored_from_upright @ found.pose.translation
@@ -184,7 +184,7 @@ class CoarsePoses:
 
     @cached_property
     def _upright_rotations(self) -> _Matrix:
-        """(n, 3, 3) cameras of the mapping photos from the world, as if held as they were read."""
+        """Return (n, 3, 3) upright cameras from the world: the mapping photos as they were read."""
         turns = [image.turn for image in self._geometry.opened.images]
         upright = {turn: _upright_from_stored(turn, 0) for turn in set(turns)}
         stacked = np.stack([upright[turn] for turn in turns])
@@ -192,7 +192,7 @@ class CoarsePoses:
 
 
 def _upright_from_stored(exif_orientation: int, turned: int) -> _Matrix:
-    """Rotation (3, 3) of the camera of a photo as stored to that of the photo as it was read.
+    """Return the rotation (3, 3) from the camera of the stored photo to that of the upright one.
 
     Args:
         exif_orientation: by which it was turned: 1, 3, 6 or 8.

@@ -1,6 +1,6 @@
-"""What priors mean in one map: which photos to search, and which poses to refuse.
+"""Priors in one map: which photos to search, and which poses to refuse.
 
-Everything here is in coordinates relative to the map's origin, where the numbers are small.
+All coordinates are relative to the map's origin, where numbers are small.
 """
 
 from __future__ import annotations
@@ -45,10 +45,11 @@ _NUM_REACH_TRIANGULATED = 10
 
 
 def _errors_of(manifest: Manifest) -> MapErrors:
-    """What a map knows of its own errors.
+    """Return the errors that a map knows of itself.
 
-    Where its photos' poses were estimated and then laid over given positions, these lie off by as
-    much as the map is bent, which its own photos cannot see. Fixes of GNSS scatter by themselves.
+    If its poses were estimated and then laid over given positions, the misfit shows how bent the
+    map is, which its own photos cannot see. So the misfit is added. That to GNSS fixes is not,
+    because fixes scatter by themselves.
     """
     test = manifest.parts.own_test
     if test is None:
@@ -128,7 +129,7 @@ class MapGeometry:
 
     @cached_property
     def resolution(self) -> WorkingResolution:
-        """How finely the photos see."""
+        """The resolution that the photos have in common (pixels per radian)."""
         cameras = {key: Resolution.of(camera) for key, camera in self.opened.cameras.items()}
         photos = [cameras[image.camera] for image in self.opened.images]
         features = self.opened.manifest.local_features.fingerprint
@@ -218,7 +219,7 @@ class Constraints:
 
     @property
     def errors(self) -> MapErrors:
-        """Of the map."""
+        """The map's own errors, which widen every covariance."""
         return self.geometry.errors
 
     @property
@@ -229,7 +230,7 @@ class Constraints:
 
     @cached_property
     def photo_weights(self) -> NDArray[np.float64] | None:
-        """(n,) how much each photo of the map counts, 0 to 1; None when all count the same."""
+        """Return weights (n,) of the map's photos, 0 to 1; None when all count the same."""
         spheres = []
         if self._priors.position is not None:
             prior = self._priors.position
@@ -348,14 +349,15 @@ def _metres(fix: GnssPrior) -> float:
 
 
 def _nearest_rays(view: MatchedView, expected: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return each pixel's ray that is nearest to an expected ray, over all focal lengths.
+    """Return, over all focal lengths, the ray of each pixel that is nearest to an expected ray.
 
     Args:
         view: of an unknown focal length.
         expected: (n, 3) of length 1, in the camera's frame.
 
     Returns:
-        (n, 3) of length 1. A pixel's ray turns in a plane, from the axis to the side.
+        (n, 3) of length 1. With the focal length, a pixel's ray turns in a plane, from the optical
+        axis to the side.
     """
     across = normalized_rays(view.camera, view.pixels)[:, :2]
     tangent = np.linalg.norm(across, axis=1)

@@ -1,8 +1,8 @@
-"""What speaks for and against a pose: what a camera there would see, and what the photo shows.
+"""Evidence for and against a pose: what a camera there would see, and what the photo shows.
 
-The mapping photos nearest to a pose tell which landmarks a camera there sees, and, as they see
-them, that nothing stands in front. Each such landmark is expected at a pixel of the photo. A
-keypoint there may have a descriptor like the landmark's, or another one, or there is none. A print
+The mapping photos nearest to the pose tell which landmarks a camera there sees; nothing hides
+these, as the photos see them. Each such landmark is expected at a pixel of the photo. There the
+photo may have a keypoint that looks like the landmark, one that looks different, or none. A print
 leaves most of the photo unexplained, a mirror image agrees in a sliver, and another floor
 contradicts where the floors differ.
 """
@@ -25,29 +25,29 @@ from visloc.pose.colmap import project
 from visloc.pose.reprojection import reprojection_errors
 from visloc.pose.views import MatchedView
 
-# The mapping photos that stand for a camera at the pose, and how much of each is looked at.
+# How many mapping photos stand for a camera at the pose; landmarks of each, and of all.
 _NUM_PHOTOS = 8
 _MAX_SEEN, _MAX_EXPECTED = 1000, 1500
-# A landmark is expected to look alike from up to this angle and ratio of distances apart.
+# A landmark should look the same within this angle, and this ratio of distances (in octaves).
 _MAX_ANGLE = np.radians(30.0)
 _MAX_OCTAVES = 1.0
-# Keypoints that may show a landmark: so many, within this part of the inlier threshold.
+# At most so many keypoints may show a landmark, within this share of the inlier threshold.
 _NUM_KEYPOINTS = 4
 _NEAR_SHARE = 0.5
-# A landmark counts as shown when it is more similar than so many are by chance.
+# A landmark counts as shown if its similarity is above this quantile of similarities by chance.
 _CHANCE = 0.95
 # The photo is divided into so many cells along its longer side.
 _CELLS = 8
-# Cells with fewer landmarks that could be compared say nothing on their own.
+# Cells with fewer compared landmarks do not count on their own.
 _MIN_IN_CELL = 5
-_CONTRADICTED = 0.15  # share of them that is explained
-# Cells with fewer keypoints than that, and than this part of the mean, need no inliers.
+_CONTRADICTED = 0.15  # a cell contradicts the pose if a smaller share of them is explained
+# Cells with fewer keypoints than this, or than this share of the mean, need no inliers.
 _MIN_KEYPOINTS, _RICH = 3.0, 0.25
-_MIN_INLIERS = 2  # that explain a cell
+_MIN_INLIERS = 2  # as many explain a cell
 _TIGHT_SHARE = 0.5
 _LEAST_DEVIATION = 1e-3  # of similarities by chance, as a part of the largest
-_MOST = 30.0  # of a feature that is not finite
-# Inliers whose errors are compared with those of their neighbours, and how many these are.
+_MOST = 30.0  # stands for a feature that is not finite
+# How many inliers are compared with their neighbours, and how many neighbours each has.
 _MAX_COHERENT, _NUM_NEIGHBOURS = 600, 3
 _LEAST = 1e-9
 
@@ -119,7 +119,7 @@ class _Compared:
     num_inliers: NDArray[np.int64]
 
 
-# What is compared, in the order of ``evidence_of``: see docs/decisions/0029-evidence-against.md.
+# The order of ``evidence_of``; docs/decisions/0029-evidence-against.md explains each.
 FEATURES = (
     "ratio",  # log odds of a match to be an inlier
     "supported",  # logarithm of inliers by keypoints
@@ -189,7 +189,7 @@ def compared_landmarks(
 
 
 def _shown_features(compared: Sequence[_Compared]) -> tuple[float, ...]:
-    """Sum up which of the expected landmarks the photos show."""
+    """Return the features that tell which of the expected landmarks the photos show."""
     num = sum(len(each.comparable) for each in compared)
     num_explained = sum(int(each.explained.sum()) for each in compared)
     above = np.concatenate([each.above_chance[each.comparable] for each in compared])
@@ -211,7 +211,7 @@ def _shown_features(compared: Sequence[_Compared]) -> tuple[float, ...]:
 
 
 def _cover_features(compared: Sequence[_Compared]) -> tuple[float, ...]:
-    """Sum up which parts of the photos the pose explains."""
+    """Return the features that tell which parts of the photos the pose explains."""
     keypoints = np.concatenate([each.num_keypoints for each in compared])
     inliers = np.concatenate([each.num_inliers for each in compared])
     expected = np.concatenate(
@@ -228,8 +228,8 @@ def _cover_features(compared: Sequence[_Compared]) -> tuple[float, ...]:
 def _coherence(explaining: Sequence[MatchedView], rig_from_world: Pose) -> float:
     """Compare the errors of inliers with the mean error of their neighbours in the photo.
 
-    Errors of keypoints are each their own. In another room of the same design, what stands a
-    little elsewhere is off as a whole.
+    Under a right pose, errors of neighbours are independent. In another room of the same design,
+    a thing that stands a little elsewhere is off as a whole, so its errors are alike.
     """
     along, total = 0.0, _LEAST
     for view in explaining:
@@ -256,7 +256,7 @@ def _compare(
     comparable, explained = np.zeros(num, dtype=np.bool_), np.zeros(num, dtype=np.bool_)
     above_chance = np.zeros(num)
     if num and len(keypoints):
-        # A tree that is not balanced is made in half the time, and asked only once.
+        # An unbalanced tree is built in half the time, and this one is asked only once.
         distances, near = KDTree(keypoints, balanced_tree=False).query(
             expected.pixels,
             k=range(1, _NUM_KEYPOINTS + 1),  # a range keeps the axis
@@ -269,7 +269,7 @@ def _compare(
         ours = expected.descriptors[comparable].astype(np.float32)
         if len(ours):
             similarity = _best(theirs, ours, there)
-            # As similar would be any other landmark in its place.
+            # By chance: the similarity of any other landmark in its place.
             chance = _best(theirs, np.roll(ours, len(ours) // 2, axis=0), there)
             deviation = max(
                 float(chance.std()), _LEAST_DEVIATION * float(np.abs(chance).max()), 1.0
@@ -359,7 +359,7 @@ def _expected(
 def _unlike(
     points: NDArray[np.float64], center: NDArray[np.float64], photo_centers: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return how differently landmarks (n, 3) look from two places; infinity for too much."""
+    """Return how differently landmarks (n, 3) look from two viewpoints; infinity beyond limits."""
     from_pose, from_photo = points - center, points - photo_centers
     away, photo_away = (
         np.maximum(np.sqrt(_dots(rays, rays)), _LEAST) for rays in (from_pose, from_photo)
@@ -384,7 +384,7 @@ def _some_rows(offsets: NDArray[np.int64], image: int) -> NDArray[np.int64]:
 
 
 def _share(part: float, whole: float) -> float:
-    """Return a share that is a half of nothing, and doubtful of little."""
+    """Return a share that tends to a half if there is little to count."""
     return float((part + 1.0) / (whole + 2.0))
 
 

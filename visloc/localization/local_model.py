@@ -26,15 +26,15 @@ from visloc.pose.colmap import normalized_rays
 from visloc.pose.triangulation import triangulated
 from visloc.retrieval.index import retrieve
 
-# Photos that each photo is matched with: those most like it.
+# Each photo is matched with so many photos that are most like it.
 NUM_NEIGHBOURS = 12
-# Rays that meet at less tell too little of how far the point is.
+# Rays that meet at a smaller angle hardly tell the distance of the point.
 MIN_ANGLE = math.radians(1.5)
 # Largest reprojection error, in pixels of the photos.
 MAX_ERROR_PX = 4.0
-# Pairs with fewer matches that their poses confirm show different places, or agree by chance.
+# Pairs with fewer matches that agree with their poses show different places, or agree by chance.
 _MIN_MATCHES = 15
-# What is kept for further queries: photos of about 60 kB, pairs of about 10 kB.
+# How many photos (about 60 kB each) and pairs (about 10 kB each) are kept for further queries.
 _KEPT_PHOTOS, _KEPT_PAIRS = 2000, 10_000
 
 Key = TypeVar("Key", bound=Hashable)
@@ -63,7 +63,7 @@ class _Kept(Generic[Key, Value]):
 
 
 class LocalModel:
-    """What the photos of a map without landmarks see. Each observation is a landmark of its own.
+    """The landmarks of a map that stores none. Each observation of a photo is a landmark.
 
     Args:
         opened: the map.
@@ -89,7 +89,7 @@ class LocalModel:
     def of_photo(self, photo: int) -> NDArray[np.float32]:
         """Return where the observations (m, 3) of a photo are, relative to the map's origin.
 
-        NaN where the photos do not tell.
+        NaN where no other photo tells the distance.
         """
         return self._photos.get(photo, self._triangulated)
 

@@ -35,16 +35,16 @@ from visloc.types import CameraSource, Reason
 
 # Refusals of photos that have too few matches for their pose.
 _TOO_FEW = (Reason.NO_POSE, Reason.TOO_FEW_INLIERS, Reason.LOW_INLIER_RATIO)
-# Places that are solved for, and how far apart its photos look at most, in radians.
+# At most so many places are solved for. Photos of one place look at most so far apart (rad).
 _MAX_PLACES, _SAME_PLACE = 4, 0.6
-# A pose with a tenth of the matches is found with a probability of 95 %, one with 8 % with 79 %.
+# So many trials find a pose with 10 % of the matches in 95 % of cases, one with 8 % in 79 %.
 _MAX_TRIALS = 3000
-# Photos that are matched near a pose, and how far apart from it they look at most, in radians.
+# At most so many photos are matched near a pose. They look at most so far apart from it (rad).
 _MAX_NEAR, _NEAR = 10, 0.9
-# Ranks are counted from here, so that one photo does not outweigh several that agree.
+# The first rank is counted as this, so that one photo does not outweigh several that agree.
 _FIRST_RANK = 3.0
-# The best of several places fits by chance more easily than the only one. So its pose needs as many
-# inliers as spare other poses the test of two halves, and must be more likely right than wrong.
+# The best of several places fits by chance more easily than a single one. So its pose needs as many
+# inliers as exempt others from the test of two halves, and must be more likely right than wrong.
 _LEAST_INLIERS, _LEAST_PROBABILITY = 100, 0.5
 
 
@@ -55,7 +55,7 @@ def solve_photo(
     priors: Priors,
     timestamp: int | None = None,
 ) -> tuple[SeenImage, Solved]:
-    """Find the pose of a photo on its own; of a refused one, by what it shows of one place.
+    """Find the pose of a single photo. If it is refused, try again with one place only.
 
     Returns:
         The image with the matches that were solved, and its pose or the first refusal.
@@ -91,7 +91,7 @@ def look_at_one_place(
     options: LocalizeOptions,
     priors: Priors,
 ) -> Look | None:
-    """Return what a refused photo on its own shows of its most promising place.
+    """Return what a refused single photo shows of its most promising place.
 
     Args:
         look: what it shows of the map.
@@ -101,7 +101,7 @@ def look_at_one_place(
         priors: they exclude mapping photos.
 
     Returns:
-        The same with other matches, to be solved and judged like any look; None when no place
+        The look with other matches, to be solved and judged like any look; None when no place
         promises more.
     """
     proposed = look.proposed
@@ -119,7 +119,7 @@ def look_at_one_place(
         return None
     weights, among = constraints.photo_weights, np.arange(len(geometry.centers))
     if options.photos is not None:
-        among = proposed.photos  # who named photos gets no others matched
+        among = proposed.photos  # a caller who named photos gets no others
     elif weights is not None:
         among = np.flatnonzero(weights > 0.0)
     near = _photos_near(best.rig_from_world, geometry, among)
@@ -140,8 +140,8 @@ def look_at_one_place(
 def _is_worth_it(look: Look, reason: Reason, options: LocalizeOptions) -> bool:
     """Tell whether a photo may be placed by fewer matches.
 
-    A photo whose focal length is a guess would fit too easily. Who asks for other thresholds than
-    the default gets these.
+    Not a photo whose focal length is a guess, because it would fit too easily. Nor one whose caller
+    asks for other thresholds than the default.
     """
     usual = PRESETS[DEFAULT_PRESET]
     return (
@@ -187,7 +187,7 @@ def _solved(
 
 
 def _photos_near(pose: Pose, geometry: MapGeometry, among: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the photos of some that look at about what a camera at a pose sees, nearest first."""
+    """Return those photos that look at about what a camera at a pose sees, nearest first."""
     apart = geometry.viewpoints.of(among).apart_from(pose)
     nearest = np.argsort(apart, kind="stable")[:_MAX_NEAR]
     return among[nearest[apart[nearest] <= _NEAR]]

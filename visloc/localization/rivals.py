@@ -1,10 +1,10 @@
 """A second place that explains an instant nearly as well as its best pose does.
 
-RANSAC over all matches returns the pose with the most inliers. Where two places look alike, that is
-a coin toss: a door has more inliers than its twin because more photos were taken of it. Here the
-searched photos that the best pose leaves unexplained are solved again, place by place, and both
-poses are compared on equal terms: keypoint by keypoint, each place with its best photos, as many of
-one as of the other.
+RANSAC over all matches returns the pose with the most inliers. If two places look alike, that is a
+coin toss: a door has more inliers than its twin because more photos were taken of it. So the
+searched photos that the best pose leaves unexplained are solved again, place by place. Then both
+poses are compared on equal terms: keypoint by keypoint, each place with the same number of its best
+photos.
 """
 
 from __future__ import annotations
@@ -38,27 +38,27 @@ from visloc.pose.search import MAX_TRIALS, search_with_pycolmap
 from visloc.pose.views import MatchedView
 from visloc.types import Candidate, LocalFeatures, Reason, Refusal
 
-# Photos of each place that are compared.
+# So many photos of each place are compared.
 NUM_COMPARED = 5
-# Places that are solved for, those with the most unexplained matches first.
+# At most so many other places are solved for, those with the most unexplained matches first.
 _MAX_PLACES = 4
-# Of the photos that show the best place, the one that speaks for it most sets the measure. A photo
-# with less than the first share of its score shows another place, if at least the second share of
-# its number of agreeing matches is as similar and unexplained.
+# The photo that speaks most for the best place is the measure. A photo shows another place if its
+# score is below the first share of that, and if it has unexplained matches that are as similar, at
+# least the second share of the measure's agreeing matches.
 _OF_THE_PLACE, _LEAST_SHARE = 0.25, 0.5
-# Photos nearer to each other than this share of how far they see are of one place.
+# Photos are of one place if they are nearer to each other than this share of their reach.
 _PLACE_REACH_SHARE = 0.5
-# Poses of two places differ by more than this beyond three standard deviations.
+# Poses of two places differ by more than this (share of the reach, angle) plus three deviations.
 _APART_REACH_SHARE, _APART_ANGLE, _STDS = 0.2, math.radians(10.0), 3.0
-# A best pose that is more likely right than wrong gives way to no place that would be refused if it
-# were alone. A search always finds one that explains a little more than chance.
+# If the best pose is more likely right than this, a rival must pass the gates on its own. For a
+# search always finds some place that explains a little more than chance.
 _MORE_LIKELY_RIGHT = 0.5
-# The probability to miss a pose with half the share of inliers, and the fewest trials.
+# Probability of missing a pose with half the best one's share of inliers; fewest trials.
 _MISSED, _MIN_TRIALS = 0.01, 100
-# Matches by chance spread evenly over the disc of the inlier threshold, right ones lie in its
-# middle. What lies within this share of the radius counts for a pose ...
+# Matches by chance spread evenly over the disc of the inlier threshold; right ones lie in its
+# middle. A match within this share of the radius counts for a pose ...
 _MIDDLE = 1 / 3
-# ... and what lies in the ring around it against it, so that chance counts nothing on average.
+# ... and one in the ring around it counts against it, so that chance adds nothing on average.
 _RING_WEIGHT = -(_MIDDLE**2) / (1.0 - _MIDDLE**2)
 
 
@@ -82,7 +82,7 @@ class Proposed:
 
     @staticmethod
     def none(features: LocalFeatures) -> Proposed:
-        """Return what was proposed for features of which there are none."""
+        """Return no proposals, for a photo without features."""
         shown = Shown(features.keypoints, round_descriptors(features.descriptors))
         return Proposed(
             shown, Proposals.none(), np.empty((0, 3), np.float32), np.empty(0, np.int64)
@@ -91,8 +91,8 @@ class Proposed:
     def matched_with(self, photos: NDArray[np.int64], geometry: MapGeometry) -> Proposed:
         """Add the pairs that further photos propose.
 
-        They are matched as the others were, except those of LightGlue: its network does not travel
-        with what was seen from one process to the next, so they are mutual nearest neighbours.
+        They are matched as the others were, with one exception. LightGlue's network is not passed
+        from process to process, so its photos are matched by mutual nearest neighbours.
         """
         further = photos[~np.isin(photos, self.photos)]
         found = propose_landmarks(
@@ -245,7 +245,7 @@ class _Pairs:
     ) -> NDArray[np.float64]:
         """Return the error of each keypoint's most similar landmark in some photos.
 
-        Infinity where it has none there.
+        Infinity for a keypoint without a landmark there.
         """
         rows = np.flatnonzero(np.isin(self.photos, photos))
         rows = rows[np.argsort(self.similarities[rows], kind="stable")]
@@ -325,8 +325,8 @@ def _compared(
 ) -> tuple[float, list[tuple[GeneralizedPose, int, int]]]:
     """Compare two poses on equal terms: each with as many photos, those that show it best.
 
-    Few photos of either place may have been searched. Others taken next to the one that shows it
-    best are matched too; of a rig, next to the one that shows it best to each camera.
+    Few photos of a place may have been searched. So photos taken next to the one that shows it best
+    are matched too; for a rig, next to the one that shows it best to each camera.
 
     Args:
         photos: of the other place, among those that were searched.

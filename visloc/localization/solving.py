@@ -58,15 +58,15 @@ class Matches:
 class Look:
     """What one image shows of the map, before a pose is solved.
 
-    Pixels are those of the image reduced by ``reduced``, in which thresholds mean the same as in
+    Pixels are those of the image reduced by ``reduced``. In these, thresholds mean the same as in
     mapping photos (``visloc.features.resolution``).
 
     Attributes:
         evidence: without inliers; its camera is that of the stored pixels.
         matches: with landmarks.
         landmarks: (n,) int64 rows of the map's landmarks, those of ``matches``.
-        elsewhere: with landmarks of photos that look more like the query but that the priors
-            exclude; usually none.
+        elsewhere: matches with landmarks of photos that look more like the query, but that the
+            priors exclude; usually none.
         refusal: why there is nothing to solve; None otherwise.
         shown: all that was found in the image; None when a pose shall not be compared with it.
         proposed: all pairs that the searched photos proposed; None when they were not kept.
@@ -86,7 +86,7 @@ class Look:
 
     @staticmethod
     def nothing(evidence: Evidence, refusal: Refusal) -> Look:
-        """Return what an image shows in which there is nothing to solve."""
+        """Return the look of an image without enough to solve."""
         return Look(evidence, Matches.none(), np.empty(0, np.int64), Matches.none(), refusal)
 
     @property
@@ -151,14 +151,13 @@ def solve_instant(
 ) -> Solved:
     """Find one pose from all images of an instant; a photo on its own is a rig of one camera.
 
-    A camera that is a guess gives poses that are metres off with centimetres of covariance. For a
-    photo on its own, the focal length is therefore estimated with the pose; if the pose is refused,
-    the answer has the guess. In a rig, and with the solver ``registration``, an image whose camera
-    is a guess is left out. If too few matches remain, the pose is refused: ``uncertain_pose``,
-    "send the camera".
+    A guessed camera gives poses that are metres off with centimetres of covariance. So a single
+    photo's focal length is estimated with the pose; if the pose is refused, the answer has the
+    guess. In a rig, and with the solver ``registration``, an image with a guessed camera is left
+    out. If too few matches remain, the pose is refused: ``uncertain_pose``, "send the camera".
 
     Args:
-        images: each of another camera of the rig.
+        images: one of each camera of the rig.
         geometry: of the map.
         options: those that the images were matched with.
         priors: what is known of the rig.
@@ -231,9 +230,9 @@ def check_solver(options: LocalizeOptions, num_cameras: int) -> None:
 def _views_of(
     images: Sequence[SeenImage], matches: Sequence[Matches], options: LocalizeOptions
 ) -> tuple[MatchedView, ...]:
-    """The views of the images that could be used, with their ``matches`` in order.
+    """Return the views of the usable images, with their ``matches`` in order.
 
-    A view whose camera is a guess is empty, unless its focal length will be estimated.
+    A view with a guessed camera is empty, unless its focal length will be estimated.
     """
     usable = [(image.cam_from_rig, image.look) for image in images if image.look is not None]
     finds_focal = _finds_focal(images, options)
@@ -254,12 +253,12 @@ def _views_of(
 
 
 def _sources_of(images: Sequence[SeenImage]) -> tuple[CameraSource, ...]:
-    """Where the cameras of the images that could be used came from."""
+    """Return where the cameras of the usable images came from."""
     return tuple(image.look.evidence.camera_source for image in images if image.look is not None)
 
 
 def _shown_in(images: Sequence[SeenImage], options: LocalizeOptions) -> tuple[Shown | None, ...]:
-    """What each view of ``_views_of`` shows; None for those whose camera is not known."""
+    """Return what each view of ``_views_of`` shows; None for those with a guessed camera."""
     finds_focal = _finds_focal(images, options)
     looks = [image.look for image in images if image.look is not None]
     return tuple(look.shown if finds_focal or not _is_guessed(look) else None for look in looks)
@@ -275,7 +274,7 @@ def _is_guessed(look: Look) -> bool:
 
 
 def _shown(image: SeenImage, found: Camera | None) -> ImageAnswer:
-    """An image's evidence, with the camera ``found`` together with the pose of the reduced one."""
+    """Return an image's evidence, with the camera that was found with the pose, unreduced."""
     evidence = None if image.look is None else image.look.evidence
     if image.look is not None and evidence is not None and found is not None:
         size = evidence.camera.width, evidence.camera.height
@@ -309,7 +308,7 @@ def measured_pose(
 
     Args:
         found: in the map's own coordinates.
-        photo_covariance: (6, 6), what the scatter of the images leaves open; the errors of the map
+        photo_covariance: (6, 6), from the scatter of the images' matches. The errors of the map
             are added here.
         geometry: of the map.
     """
@@ -354,9 +353,9 @@ def _find_pose(
 ) -> tuple[Problem, GeneralizedPose | None, Refusal | None]:
     """Return the search, its best pose or None, and the reason to refuse it or None.
 
-    Where a photo on its own contradicts the focal length of its EXIF, the search is the one that
-    finds the focal length with the pose. A camera that was given is a statement; one from EXIF is a
-    hint, which editing and zooming leave behind.
+    If a single photo contradicts the focal length of its EXIF, the search is repeated without it,
+    and finds the focal length with the pose. A given camera is a statement and is not doubted so.
+    EXIF is a hint, which editing and zooming make wrong.
     """
     refusal = _nothing_to_solve(images, problem)
     if refusal is not None:
@@ -372,12 +371,12 @@ def _find_pose(
 
 
 def _without_exif(problem: Problem, pose: GeneralizedPose) -> Problem | None:
-    """Take the focal length of EXIF for a guess, where nothing else contradicts the photo."""
+    """Treat the focal length of EXIF as a guess, if nothing else contradicts the photo."""
     if problem.sources != (CameraSource.EXIF,) or problem.options.solver is Solver.REGISTRATION:
         return None
     (view,) = problem.views
-    # The gate may have found these intrinsics already, if no prior refused the pose before. To find
-    # them again takes little beside the second search, which only such photos get.
+    # The gate may have found these intrinsics already. Finding them again takes little, compared
+    # with the second search, which only such photos get.
     if not only_focal_length_contradicts(
         view, CameraSource.EXIF, pose.rig_from_world, problem.registration.max_error_px
     ):
@@ -394,7 +393,7 @@ def _judged(problem: Problem) -> tuple[GeneralizedPose | None, Refusal | None]:
 
 
 def _nothing_to_solve(images: Sequence[SeenImage], problem: Problem) -> Refusal | None:
-    """Why there are too few matches to look for a pose."""
+    """Say why there are too few matches to search for a pose."""
     looks = [image.look for image in images if image.look is not None]
     if not looks:
         why = "none of the images could be used" if images else "there is no image"

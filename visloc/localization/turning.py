@@ -1,9 +1,9 @@
-"""In which turn a map knows a photo of a camera that was held turned, without EXIF.
+"""Find the turn in which a map knows a photo, if its camera was held turned and EXIF is silent.
 
-Local features tolerate rolls of about 30 degrees. To look at every turn as thoroughly as at the
-photo itself would multiply the time of each hopeless photo. Telling whether a turn is worth it
-takes little: the strongest keypoints, the most similar mapping photos, and how many matches are
-clear (docs/decisions/0036-turned-cameras.md).
+Local features tolerate rolls of about 30 degrees. Looking at every turn as thoroughly as at the
+photo itself would multiply the time of each hopeless photo. A cheap test tells whether a turn is
+worth it: the clear matches of the strongest keypoints with the most similar mapping photos
+(docs/decisions/0036-turned-cameras.md).
 """
 
 from __future__ import annotations
@@ -28,25 +28,26 @@ from visloc.priors import Priors
 from visloc.retrieval.index import retrieve
 from visloc.types import Evidence, LocalFeatures, Reason
 
-# Usual refusals of a photo whose features were found in another turn than the map's.
+# The usual refusals of a turned photo.
 REASONS_OF_TURNED_PHOTOS = (
     *(Reason.TOO_FEW_MATCHES, Reason.NO_POSE, Reason.TOO_FEW_INLIERS, Reason.LOW_INLIER_RATIO),
 )
-# A symmetric room has a wrong pose for a photo that is upside down.
+# In a symmetric room, a photo that is upside down gets a wrong pose.
 _WORTH_TURNING = (*REASONS_OF_TURNED_PHOTOS, Reason.UNCERTAIN_POSE, Reason.UNLIKELY_POSE)
-# Degrees clockwise. Whoever holds a camera upside down does not hold it askew as well.
+# Degrees clockwise. 135 and 225 are left out: a camera is hardly held upside down and askew.
 _QUARTERS, _ASKEW = (90, 180, 270), (45, 315)
 _ALL = (*_QUARTERS, *_ASKEW)
 _STEP_DEG = 45
 _NUM_KEYPOINTS, _NUM_PHOTOS = 1000, 3
-# A turn is worth a try with this many clear matches with one photo, and with so many times as many
-# as come by chance, if the photo as it was has fewer.
+# A turn is worth a try if it has this many clear matches with one photo, this many times as many as
+# come by chance, and more than the photo as it was.
 _LEAST_CLEAR, _TIMES_BY_CHANCE = 20, 2.0
-# A photo that is held askew shows something when it is turned by 45 degrees too little or too much.
+# Askew turns are looked at only if the turns so far promise by this factor: a photo that is held
+# askew already matches a little when it is off by 45 degrees.
 _TIMES_NEXT_TO_IT = 1.5
-# With so many, no other turn is looked at.
+# With so many clear matches, no other turn is looked at.
 _SURELY_CLEAR = 100
-# Of a unit vector: gravity that lies nearer to the optical axis does not tell the roll.
+# Least part of gravity (a unit vector) across the optical axis. With less, it tells no roll.
 _LEAST_ACROSS = 0.4
 
 
@@ -82,7 +83,7 @@ class TurnFinder:
         cache: FeatureCache,
         step: Callable[[], None] = lambda: None,
     ) -> int:
-        """Return the degrees clockwise by which to turn a refused photo; 0 when nothing promises.
+        """Return by how many degrees clockwise to turn a refused photo; 0 when no turn promises.
 
         Args:
             photo: pixels as stored.
@@ -158,8 +159,8 @@ def turn_that_promises(counts: Mapping[int, int]) -> int:
 
 def _promises(counts: Mapping[int, int], times: float) -> bool:
     """Tell whether the best turn has so many times as many clear matches as come by chance."""
-    # Most turns show nothing of the map, so that half of them have what comes by chance. Fewer than
-    # all were looked at when one was surely clear: that one is not part of the half.
+    # Most turns show nothing of the map, so the lower half of the counts is chance. If a surely
+    # clear turn ended the search early, it is not in that half.
     by_chance = sorted(counts.values())[max(0, len(counts) // 2 - 1)]
     return max(counts.values()) >= max(_LEAST_CLEAR, times * by_chance)
 
@@ -172,6 +173,6 @@ def _turns_by(gravity: KnownGravity | None, photo: Photo) -> tuple[int, ...]:
     ends = np.array([[0.0, 0.0], gravity.rig[:2]])
     start, end = upright_from_stored(ends, turn_of(photo.exif_orientation), *size)
     x, y = end - start
-    # Turned clockwise by this, what points to (x, y) points down.
+    # Turned clockwise by this, (x, y) points down.
     turned = int(np.round(np.degrees(np.arctan2(x, y)) / _STEP_DEG)) * _STEP_DEG % 360
     return (turned,) if turned else ()

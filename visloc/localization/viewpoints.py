@@ -29,7 +29,7 @@ class Viewpoints:
         return len(self.centers)
 
     def of(self, images: NDArray[np.int64]) -> Viewpoints:
-        """Those of some photos."""
+        """Return the viewpoints of some photos."""
         return Viewpoints(self.centers[images], self.rotations[images], self.reach)
 
     def pose(self, image: int) -> Pose:
@@ -38,5 +38,5 @@ class Viewpoints:
         return Pose(rotation, -rotation @ self.centers[image])
 
     def apart_from(self, pose: Pose) -> NDArray[np.float64]:
-        """How far each photo (n,) is from a pose, in radians, as ``viewpoints_apart``."""
+        """Return the distance (n,) of each photo from a pose, in radians (``viewpoints_apart``)."""
         return viewpoints_apart(self.rotations, self.centers, pose, self.reach)

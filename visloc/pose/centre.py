@@ -1,6 +1,6 @@
-"""A pose and its covariance, seen from the camera's centre, from another origin or frame.
+"""Convert a pose and its covariance: to the camera's centre, to another origin, to another frame.
 
-As in ``covariance``: R <- Exp(w) R, t <- t + dt; 6 x 6, w (rad) before dt.
+Conventions as in ``covariance``: R <- Exp(w) R, t <- t + dt; 6 x 6, w (rad) before dt.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from visloc.geometry import Pose, Similarity, cross_matrix
 def position_covariance(
     cam_from_world: Pose, covariance: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Covariance (3, 3) of the camera centre in the world, from that of the pose (6, 6).
+    """Return the covariance (3, 3) of the camera centre in the world, from that of the pose (6, 6).
 
-    The centre is -R^T t; moving R by Exp(w) and t by dt moves it by -R^T (dt + [t] w), with [t]
-    the matrix of the cross product.
+    The centre is -R^T t. If R moves by Exp(w) and t by dt, it moves by -R^T (dt + [t] w), where [t]
+    is the matrix of the cross product.
     """
     jacobian = -cam_from_world.rotation.T @ np.hstack(
         [cross_matrix(cam_from_world.translation), np.eye(3)]
@@ -32,8 +32,8 @@ def with_origin(
 ) -> tuple[Pose, NDArray[np.float64]]:
     """Move a pose found in coordinates relative to ``origin`` (3,) to the world.
 
-    x_local = x_world - origin, so t_world = t_local - R origin; the covariance of t_world
-    gains the part that the rotation causes at that distance.
+    x_local = x_world - origin, so t_world = t_local - R origin. The covariance of t_world grows by
+    the rotation's error times the distance of the origin.
     """
     jacobian = np.eye(6)
     jacobian[3:, :3] = cross_matrix(cam_from_local.rotation @ origin)
@@ -51,8 +51,9 @@ def moved_pose(
 ) -> tuple[Pose, NDArray[np.float64]]:
     """Move a pose and its covariance (6, 6) to another frame and unit.
 
-    The translation t_a = scale t_b - R_a t, with R_a and t_a of the result and t of ``a_from_b``,
-    moves with that of b, and with the rotation as far as the origins lie apart.
+    The translation is t_a = scale t_b - R_a t, with R_a and t_a of the result and t of
+    ``a_from_b``. So its error has two parts: that of t_b, and the rotation's times the distance
+    between the origins.
     """
     pose = a_from_b.move(device_from_b)
     jacobian = np.eye(6)

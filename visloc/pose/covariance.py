@@ -1,4 +1,4 @@
-"""How uncertain a pose is, from the residuals of its own inliers.
+"""The covariance of a pose, from the residuals of its own inliers.
 
 Poses are perturbed as R <- Exp(w) R, t <- t + dt; covariances are 6 x 6, w (rad) before dt.
 """
@@ -21,23 +21,23 @@ _MIN_VARIANCE_PX2 = 1e-12
 # Smallest eigenvalue of the unit-free information matrix, of largest diagonal 1.
 _MIN_INFORMATION = 1e-9
 _SANDWICH_SCATTER = 2.0
-# Standard deviation of the logarithm of an unknown focal length. Beyond, as with a plane nearly
-# parallel to the image, the error is no longer linear in those of the pixels: by Monte Carlo with
-# an exact principal point, the stated 95 % held 50 to 80 % of the errors.
+# Largest standard deviation of the logarithm of an unknown focal length. It is exceeded by a plane
+# that is nearly parallel to the image. Then the pose's error is no longer linear in those of the
+# pixels: in a Monte Carlo test with an exact principal point, the stated 95 % held 50 to 80 %.
 _MAX_FOCAL_STD = 0.03
-# Who does not know the focal length does not know either by how much the principal point is off
-# the centre: so much of the longer side.
+# If the focal length is unknown, so is the principal point. Its standard deviation about the centre
+# of the picture, as a share of the longer side.
 _PRINCIPAL_POINT_STD = 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseCovariance:
-    """What leaves a pose open.
+    """The covariance of a pose, and the part of it that comes from an unknown camera.
 
     Attributes:
-        whole: (6, 6).
-        of_camera: (6, 6) of it, what the doubt in the principal point adds. It says nothing of the
-            matches. None where the camera is known.
+        whole: (6, 6), all of it.
+        of_camera: (6, 6), the part that an unknown principal point adds, whatever the matches are.
+            None for a known camera.
     """
 
     whole: NDArray[np.float64]
@@ -50,10 +50,10 @@ def pose_covariance(
     """Return the covariance of a rig's pose that was refined on these inliers with a Cauchy loss.
 
     There are two classical estimates for an M-estimator. Huber's (Huber 1981, section 7.6) assumes
-    one common spread of the residuals and is steady with few points. The sandwich (Huber 1967,
-    White 1980) is right when some landmarks scatter more than others. Along every direction the
-    wider one counts. pycolmap's own covariance assumes one pixel of noise and counts rotation in
-    half-angles. Checked by Monte Carlo in tests/visloc/pose.
+    one common spread of the residuals, and is steady with few points. The sandwich (Huber 1967,
+    White 1980) is right when some landmarks scatter more than others. In every direction the
+    wider one counts. (pycolmap's own covariance assumes one pixel of noise and counts rotation in
+    half-angles.) Tests in tests/visloc/pose check it by Monte Carlo.
 
     Args:
         views: inliers only; some views may have none. Inliers at the very edge of the picture,
@@ -63,8 +63,8 @@ def pose_covariance(
         loss_scale_px: scale c of the loss c^2 / 2 log(1 + r^2 / c^2).
 
     Returns:
-        That of ``rig_from_world``, or None when the inliers leave the pose undetermined, or an
-        unknown focal length, and with it the distance, by more than 3 %.
+        The covariance of ``rig_from_world``. None if the inliers leave the pose undetermined, or
+        an unknown focal length uncertain by more than 3 %, and with it the distance.
     """
     if not views:
         return None
@@ -92,8 +92,8 @@ def pose_covariance(
     # Never quite zero: exact correspondences, as in tests, would leave nothing to compare.
     root *= math.sqrt(max(np.sum(psi**2) / spare, _MIN_VARIANCE_PX2)) / slope
     sandwich = bread @ scatter @ bread * (2 * num_points / spare)
-    # The sandwich scatters by about 1 / sqrt(n) in each direction: the largest of both would be
-    # too wide by that in half of them, were it not taken off first.
+    # The sandwich scatters by about 1 / sqrt(n) in each direction. Taking the wider of both would
+    # be too wide by that in half of the directions, so it is subtracted first.
     wider = _wider(root, sandwich / (1.0 + _SANDWICH_SCATTER / math.sqrt(num_points)))
     if num_parameters == 6:
         return PoseCovariance(wider, None)
@@ -109,7 +109,7 @@ def pose_covariance(
 def _of_principal_point(
     by_point: NDArray[np.float64], views: Sequence[MatchedView]
 ) -> NDArray[np.float64]:
-    """What the doubt in the principal point adds (6, 6).
+    """Return the covariance (6, 6) that an uncertain principal point adds.
 
     Args:
         by_point: (6, 2) derivative of the pose by the principal point.
@@ -165,7 +165,7 @@ def _without_units(
 
 
 def _wider(root: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The smallest covariance that is at least ``root root^T`` and ``b`` along common axes."""
+    """Return the smallest covariance that is at least ``root root^T`` and ``b``, on common axes."""
     inverse = np.linalg.inv(root)
     ratios, axes = np.linalg.eigh(inverse @ b @ inverse.T)
     half = root @ (axes * np.sqrt(np.maximum(ratios, 1.0)))

@@ -1,4 +1,4 @@
-"""How far two poses are apart, in units of what both leave open."""
+"""The distance between two poses, in units of their uncertainty."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from visloc.geometry import Pose, center_covariance
 
-# Poses of different photos disagree by this much for reasons that no covariance tells.
+# Poses of different photos disagree by this much for reasons that are in no covariance.
 _MAP_STD_RAD, _MAP_STD = math.radians(0.1), 0.01
 
 
@@ -44,8 +44,8 @@ def viewpoints_apart(
 ) -> NDArray[np.float64]:
     """How far viewpoints (n,) are from a pose, in radians.
 
-    The sum of two angles by which what is seen moves: that of the turn, and that under which the
-    way between both is seen from where the photos look.
+    The sum of two angles by which the picture moves: that of the turn, and the parallax, that is,
+    the distance between both viewpoints as seen from the scene.
 
     Args:
         rotations: (n, 3, 3) camera from world.

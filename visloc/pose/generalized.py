@@ -26,13 +26,13 @@ from visloc.pose.search import (
 )
 from visloc.pose.views import MatchedView
 
-# Focal lengths in units of the longer side, from 136 degrees across to 6: all that photos are
-# taken with. What lies beyond explains wrong matches, in a spot or in a flat picture.
+# Focal lengths in units of the longer side, from 136 degrees across to 6: all usual lenses. Poses
+# with others explain wrong matches, such as those in a spot or in a flat picture.
 MIN_FOCAL, MAX_FOCAL = 0.2, 10.0
 # Steps of refinement that tell which of several poses is the best.
 _STEPS_TO_COMPARE = 5
-# Of a plane nearly parallel to the image, focal length and distance are a narrow valley: thirty
-# steps end in it a dozen stated standard deviations from its lowest point.
+# For a plane nearly parallel to the image, focal length and distance form a narrow valley. Thirty
+# steps would end in it, a dozen stated standard deviations from its lowest point.
 _STEPS_WITH_FOCAL = 300
 
 
@@ -49,8 +49,8 @@ class GeneralizedPose:
         camera: with the focal length that was found together with the pose; None where it was
             known.
         probability: that it is right, 0 to 1; None when it was not judged.
-        of_camera: (6, 6) of ``covariance``, what the doubt in the principal point adds; None where
-            the camera was known.
+        of_camera: (6, 6), the part of ``covariance`` that an unknown principal point adds; None
+            for a known camera.
     """
 
     rig_from_world: Pose
@@ -80,17 +80,16 @@ def estimate_generalized_pose(
 ) -> GeneralizedPose | None:
     """Solve for the pose of a rig and refine it on the inliers of all its cameras.
 
-    Without gravity by the solver. ``pycolmap`` and ``poselib`` are LO-RANSAC with P3P or GP3P, over
-    a sample of 1000 where there are more: poses that explain less than about 4 % of the
-    correspondences are not searched for; the refinement is the same for both. ``registration`` has
-    a search and a refinement of its own (``visloc.pose.registration``).
+    What is known decides how the pose is searched for:
 
-    With gravity by RANSAC with two correspondences (see ``visloc.pose.gravity``), whatever the
-    solver; gravity only guides the search, the refinement, the same as above, leaves all six
-    degrees of freedom.
-
-    With an unknown focal length by pycolmap's LO-RANSAC with P4Pf and P3P, whatever the solver and
-    without gravity; the refinement finds the focal length, too.
+    - Neither of the cases below: by ``solver``. ``pycolmap`` and ``poselib`` are LO-RANSAC with
+      P3P or GP3P over at most 1000 correspondences, so poses that explain less than about 4 % are
+      not searched for. Their refinement is the same. ``registration`` has a search and a
+      refinement of its own (``visloc.pose.registration``).
+    - Gravity is known: RANSAC with two correspondences (``visloc.pose.gravity``), whatever the
+      solver. Gravity only guides the search; the refinement leaves all six degrees of freedom.
+    - The focal length is unknown: pycolmap's LO-RANSAC with P4Pf and P3P, whatever the solver,
+      without gravity. The refinement finds the focal length too.
 
     Args:
         views: what each camera sees; some may have no correspondences.
@@ -100,10 +99,9 @@ def estimate_generalized_pose(
         solver: a key of ``SOLVERS``.
 
     Returns:
-        The pose, or None when there are fewer than four correspondences or none was found that
-        explains four, or with no focal length that a camera has. The solver finds a pose in
-        almost anything: the caller must judge the inliers, and, with gravity,
-        ``gravity_deviation``.
+        The pose. None if there are fewer than four correspondences, if no pose explains four, or
+        if no camera has such a focal length. The solver finds a pose in almost anything, so the
+        caller must judge the inliers and, with gravity, ``gravity_deviation``.
 
     Raises:
         ValueError: a view has not as many pixels as points; there are several with an unknown
@@ -129,8 +127,8 @@ def refine_generalized_pose(
         max_error_px: largest reprojection error of an inlier, in each camera's pixels.
 
     Returns:
-        The pose, or None when fewer than four correspondences are inliers of the start or of the
-        refined pose, or the focal length is none that a camera has.
+        The pose. None if fewer than four correspondences are inliers of the start or of the
+        refined pose, or if no camera has such a focal length.
 
     Raises:
         ValueError: a view has not as many pixels as points.
@@ -209,7 +207,7 @@ def _with_focal_length(
 
 
 def _is_usable(camera: Camera) -> bool:
-    """Whether photos are taken with a focal length that was found together with a pose."""
+    """Tell whether a lens may have the focal length that was found with a pose."""
     longer_side = max(camera.width, camera.height)
     return MIN_FOCAL <= camera.focal_length / longer_side <= MAX_FOCAL
 
@@ -217,7 +215,7 @@ def _is_usable(camera: Camera) -> bool:
 def _best_refined(
     views: Sequence[MatchedView], starts: Sequence[Pose], max_error_px: float
 ) -> GeneralizedPose | None:
-    """The pose that explains most, of those that the starts lead to."""
+    """Return the pose that explains most, of those that the starts lead to."""
     if len(starts) > 1:
         tried = [
             refine(views, start, max_error_px=max_error_px, max_steps=_STEPS_TO_COMPARE)

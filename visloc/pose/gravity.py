@@ -1,7 +1,7 @@
-"""A pose of which gravity is known: two correspondences make one, instead of three.
+"""Find a pose whose gravity is known: two correspondences determine it, instead of three.
 
-Two of the three angles are known, so that a rotation about the vertical and a translation are left
-to find. At 10 % inliers one sample of two in 100 is right, where it is one of three in 1000.
+Gravity gives two of the three angles. A rotation about the vertical and a translation remain. At
+10 % inliers, one sample of two correspondences in 100 is right, but only one of three in 1000.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ _SAMPLE_SIZE = 2
 # At 5 % inliers one sample is right with the stated confidence.
 _MAX_SAMPLES = 4_000
 _CONFIDENCE = 0.9999
-# Not every sample of right correspondences makes a good pose: noise, and gravity's own error.
+# A sample of right correspondences may give a bad pose, by noise and by gravity's own error.
 _SAMPLES_PER_NEED = 3.0
 _BATCH = 16  # small enough for the processor's cache: twice as fast as 32
-# More tell no better which pose is right, and take longer.
+# More do not tell better which pose is right, and take longer.
 _MAX_SCORED = 500
 _MAX_CANDIDATES = 5
 # Wider than this, chance explains as much as the truth.
@@ -39,7 +39,7 @@ class KnownGravity:
     Attributes:
         rig: (3,) unit vector that points down, in the rig's frame.
         world: (3,) unit vector that points down, in the world's.
-        std: standard deviation of the angle between what both say, rad.
+        std: standard deviation of the angle between both, rad.
     """
 
     rig: NDArray[np.float64]
@@ -183,7 +183,7 @@ def _scores(
 
 
 def _num_needed(share: float) -> int:
-    """Samples after which one of right correspondences was among them, with the confidence."""
+    """Return after how many samples one was right, with the stated confidence."""
     right = share**_SAMPLE_SIZE
     if not 0.0 < right < 1.0:
         return 0 if right else _MAX_SAMPLES

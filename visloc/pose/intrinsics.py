@@ -1,4 +1,4 @@
-"""The intrinsics that a photo's own matches speak for, beside those that were given.
+"""Find the intrinsics that fit a photo's own matches best, to compare with the given ones.
 
 Every camera model multiplies by the focal length at last, then adds the principal point. A change
 of both is therefore an affine map of the given camera's pixels, whatever the model:
@@ -27,12 +27,12 @@ _ALL = (FOCAL, SHIFT_X, SHIFT_Y, ASPECT)
 # there are, they tell no more than this many independent ones
 # (docs/decisions/0027-a-camera-that-is-checked.md).
 _INDEPENDENT_MATCHES = 16.0
-# For that reason, more inliers change little. Of few, none may be missed: wrong matches within the
-# widest threshold outnumber them.
+# For that reason, more inliers change little. If there are few, none may be left out, because wrong
+# matches within the widest threshold outnumber them.
 _MAX_INLIERS, _MAX_MATCHES = 200, 1000
 _MIN_MATCHES = 10  # as many as there are parameters
-# Thresholds and loss scales in units of the last: under a camera that is wrong by a factor of two,
-# most matches lie farther away than an inlier may.
+# Thresholds and loss scales of the rounds, in units of the last. If the camera is wrong by a factor
+# of two, most matches lie farther away than an inlier may, so the first round is wide.
 _WIDTHS = (4.0, 2.0, 1.0)
 _MAX_STEPS = (6, 6, 20)
 _MAX_CHANGE = 0.5  # in one step
@@ -148,7 +148,7 @@ def _near(view: MatchedView, rig_from_world: Pose, max_error_px: float) -> Match
 
 
 def _promised_gain(state: _State, max_error_px: float, width: float) -> float:
-    """What ``gain`` would be if the loss were quadratic; 0 when the matches are too few."""
+    """``gain`` as it would be with a quadratic loss; 0 when there are too few matches."""
     normal = _normal_equations(state, max_error_px, width)
     if normal is None:
         return 0.0
@@ -235,7 +235,7 @@ def _state(
 
 
 def _loss(state: _State, max_error_px: float, width: float = 1.0) -> float:
-    """Of all matches, px^2; constant beyond the threshold and behind the camera."""
+    """Return the loss of all matches, px^2; constant beyond the threshold and behind the camera."""
     squared = np.sum(state.errors**2, axis=1)
     largest, scale2 = (width * max_error_px) ** 2, (width * LOSS_SCALE_PX) ** 2
     squared = np.where(squared <= largest, squared, largest)  # NaN too

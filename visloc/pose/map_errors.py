@@ -1,4 +1,4 @@
-"""What a map adds to the uncertainty of a pose: errors that its landmarks share.
+"""The errors of a map, which its landmarks share: they add to the uncertainty of every pose.
 
 The residuals of one photo cannot show them: a depth that is off, a calibration, the poses of
 mapping photos, a map that is bent. A map's own test measures them (``mapping.own_test``).

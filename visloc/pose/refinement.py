@@ -134,7 +134,7 @@ def _zoomed(views: Sequence[MatchedView], zoom: float) -> Sequence[MatchedView]:
 
 
 def _loss(error: NDArray[np.float64]) -> NDArray[np.float64]:
-    """That of an inlier's error (...) in pixels."""
+    """Return the Cauchy loss of errors (...) in pixels."""
     return np.asarray(0.5 * LOSS_SCALE_PX**2 * np.log1p((error / LOSS_SCALE_PX) ** 2))
 
 

@@ -158,7 +158,7 @@ def _in_32_bits(pose: Pose) -> Pose:
 
 
 def _searched(views: Sequence[MatchedView]) -> list[MatchedView]:
-    """Of each view, in proportion, the correspondences that RANSAC looks at."""
+    """Sample the correspondences for RANSAC: of each view in proportion."""
     share = _MAX_SEARCHED / max(sum(len(view) for view in views), _MAX_SEARCHED)
     sampled = [_sample(view, round(share * len(view))) for view in views]
     return [_finite(view) for view in sampled]
@@ -196,7 +196,7 @@ def _rigid(pose: Pose) -> pycolmap.Rigid3d:
 
 
 def _as_pinhole(view: MatchedView) -> MatchedView:
-    """What a pinhole of the same focal length sees, without pixels that have no ray."""
+    """Undistort to a pinhole of the same focal length; drop pixels that have no ray."""
     focal = view.camera.focal_length
     camera = Camera("SIMPLE_PINHOLE", view.camera.width, view.camera.height, (focal, 0.0, 0.0))
     rays = normalized_rays(view.camera, view.pixels)[:, :2]

@@ -1,4 +1,4 @@
-"""What the cameras of a rig see of a map."""
+"""The views of a rig's cameras: their matches with a map."""
 
 from __future__ import annotations
 

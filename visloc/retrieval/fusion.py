@@ -26,7 +26,7 @@ from visloc.options import DEFAULT_FUSION_PARAMETER, Fusion, LocalizeOptions
 
 _Scores = NDArray[np.float64]
 FusionOperator = Callable[[_Scores, _Scores, float], _Scores]
-# Of an operator that has no parameter.
+# The parameter of an operator that has none.
 _Plain = Callable[[_Scores, _Scores], _Scores]
 
 
@@ -149,7 +149,7 @@ def round_robin(
 def villena_roman(similarities: _Scores, weights: _Scores, beta: float) -> _Scores:
     """``(1 - beta) max(s_i) + beta min(s_i)^2 / (max(s_i) + min(s_i))``; weights do not matter.
 
-    From 0 on, ``min(s_i)`` stands for the quotient, which has a pole there.
+    At 0 and below, ``min(s_i)`` replaces the quotient, which has a pole there.
     """
     del weights
     low, high = similarities.min(axis=0), similarities.max(axis=0)

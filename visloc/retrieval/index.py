@@ -14,22 +14,22 @@ from visloc.retrieval.fusion import EQUAL_GHARM, LateFusion
 from visloc.retrieval.inverted import InvertedFile, largest
 from visloc.retrieval.rows import GlobalRows
 
-# Larger maps are written with an inverted file unless a build asks for something else.
+# Maps with more photos get an inverted file, unless a build asks for something else.
 MAX_EXACT = 10_000
-# In a map with an inverted file: so many photos that priors allow are all compared.
+# In a map with an inverted file, up to so many photos that priors allow are all compared.
 _MAX_ALLOWED_EXACT = 2000
 # Photos that each descriptor proposes, and lists that it searches (docs/performance.md).
 _MIN_PROPOSED, _PROPOSED_PER_RESULT = 300, 10
 _LISTS = 50
-# No cosine, and no limit of one that codes tell, is so large.
+# Larger than any cosine, and than any bound of a cosine from codes.
 _ABOVE_ALL = 2.0
-# Where proposals do not stand out among at most so many photos, the codes of all are compared; of
-# the best by these, so many rows and this share under the first descriptor, and of these the best
-# half under the next.
+# If proposals do not stand out among at most so many photos, the codes of all are compared. So many
+# of the best, and this share, are compared under the first descriptor, and the best half of these
+# under the next.
 _MAX_DOUBTFUL, _DOUBTFUL_ROWS, _DOUBTFUL_SHARE = 50_000, 1500, 0.09
 _KEPT_BY_EACH = 0.5
-# Among more photos, so many times as many are proposed, from so many times as many lists. That is
-# done where less than half of what is wanted stands out: the query's place is not among them.
+# Among more photos, so many times as many are proposed, from so many times as many lists, if less
+# than half of the wanted photos stand out: then the query's place is not among the proposals.
 _WIDER_PROPOSED, _WIDER_LISTS = 20, 4
 
 
@@ -65,9 +65,9 @@ def retrieve(
 ) -> Retrieved:
     """Rank the photos of a map by fused similarity to a query.
 
-    In maps with an inverted file each descriptor proposes the photos that are most like the query
-    by their codes, and all proposals are compared under all descriptors. Where they do not stand
-    out, all codes propose. In other maps, and where priors leave few photos, all are compared.
+    In maps with an inverted file, each descriptor proposes the photos most like the query by their
+    codes, and all proposals are compared under all descriptors. If they do not stand out, more are
+    proposed. In other maps, and if priors leave few photos, all photos are compared.
 
     Args:
         query: unit vector (D,) by global descriptor; a zero vector is similar to nothing.
@@ -143,8 +143,8 @@ def _compared(
     count, lists = max(_MIN_PROPOSED, _PROPOSED_PER_RESULT * top_k), _LISTS
     many = left > _MAX_DOUBTFUL
     if many:
-        # Photos that priors leave may lie in lists further away; if few, doubts about the
-        # proposals cost less than more lists.
+        # Photos that priors leave may lie in lists further away. If there are few, checking
+        # doubtful proposals is cheaper than more lists.
         lists = math.ceil(lists * len(allowed) / left)
     photos, limits = _proposed(query, files, allowed, min(left, count), lists)
     cosines = _cosines(query, index, photos)
@@ -167,8 +167,8 @@ def _proposed(
 ) -> tuple[NDArray[np.int64], dict[str, float]]:
     """The allowed photos that are most like the query by their codes, in the order of the map.
 
-    Also returns, by descriptor, the cosine that photos which were not proposed have at most, as
-    far as codes can tell: ``_ABOVE_ALL`` where there were fewer than ``count`` to propose.
+    Also returns, by descriptor, an upper bound of the cosine of all other photos, as far as codes
+    can tell: ``_ABOVE_ALL`` if there were fewer than ``count`` to propose.
     """
     photos, limits = [], {}
     for name, file in files.items():

@@ -20,7 +20,7 @@ CSI_POWER = 8.0
 # they lie apart.
 MOST_EXTRAPOLATED = 10.0
 
-# Takes unit rows: the query (D,) and retrieved photos (k, D). Returns (k,) of sum 1.
+# From unit rows, the query (D,) and retrieved photos (k, D), to weights (k,) with sum 1.
 Weighting = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 
 
@@ -33,10 +33,10 @@ def equal_weighted(query: NDArray[np.float64], photos: NDArray[np.float64]) -> N
 def barycentric(query: NDArray[np.float64], photos: NDArray[np.float64]) -> NDArray[np.float64]:
     """BDI, barycentric descriptor interpolation: ``argmin |q - sum(w_i d_i)|`` with sum 1.
 
-    Weights may be negative. Where several are as good, as of photos that are the same, these are
-    the ones nearest to equal weights. Photos that are almost the same would get huge weights of
-    both signs, which say nothing and carry the pose far away: weights are drawn towards equal ones
-    until their distances from these sum to ``MOST_EXTRAPOLATED`` at most.
+    Weights may be negative. If several solutions are equally good, as for identical photos, the one
+    nearest to equal weights is returned. Photos that are almost identical would get huge weights of
+    both signs, which say nothing and carry the pose far away. Weights are therefore drawn towards
+    equal ones until their distances from these sum to ``MOST_EXTRAPOLATED`` at most.
     """
     equal = equal_weighted(query, photos)
     # Differences from equal weights that keep the sum: orthogonal to (1, ..., 1).
@@ -52,8 +52,8 @@ def cosine_similarity(
 ) -> NDArray[np.float64]:
     """CSI, cosine similarity: ``w_i = (q . d_i)^8 / sum_j (q . d_j)^8``.
 
-    A negative cosine is no similarity and counts 0, where an even power would count it. Equal
-    weights if nothing is similar.
+    A negative cosine counts as 0; the even power alone would make it positive. Equal weights if
+    nothing is similar.
     """
     similar = np.maximum(photos @ query, 0.0)
     if similar.max(initial=0.0) <= 0.0:

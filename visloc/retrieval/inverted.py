@@ -2,9 +2,9 @@
 
 Rows are clustered (Sivic and Zisserman 2003). The list of a cluster holds a code of one bit per
 dimension for each of its rows (RaBitQ, Gao and Long 2024), and the row's number. faiss maps the
-lists from their file and searches them; it never parses a file. Whoever opens an inverted file
-checks its plain arrays first (``visloc.archive.index_files``): faiss's own readers, which would
-parse what strangers wrote, are not used (docs/decisions/0034-the-index-is-faiss.md).
+lists from their file and searches them; it never parses a file. faiss's own readers would parse
+untrusted bytes, so they are not used. ``visloc.archive.index_files`` checks the plain arrays when
+an inverted file is opened (docs/decisions/0034-the-index-is-faiss.md).
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 
 _ITERATIONS = 10
 _SAMPLES_PER_LIST = 50
-# Of a centre's length, also where all of its rows went elsewhere.
+# Least length of a centre, even if all of its rows went to other centres.
 _LEAST_ALIKE = 0.05
 _BLOCK_ROWS = 4096
-# Codes are whole words of so many bits, so that the numbers behind them are aligned.
+# Codes fill whole words of so many bits, so that the numbers after them are aligned.
 _WORD_BITS = 64
 ID_BYTES, FACTOR_BYTES = 8, 8
-# Bits in which a query is rounded for the comparison with codes.
+# A query is rounded to so many bits before it is compared with codes.
 _QUERY_BITS = 6
 # Numbers converted to float32 at once: 1 MiB stays in the cache of a core, and is too small for
 # BLAS to wake other threads, which costs more than the product.
@@ -65,7 +65,7 @@ class InvertedFile:
         lists: the file: for each list its codes, then the numbers of its rows as int64.
 
     Attributes:
-        error: two standard deviations of a rough cosine to a query that is like no centre.
+        error: two standard deviations of a rough cosine, for a query that resembles no centre.
     """
 
     __slots__ = ("_index", "_lengths", "centers", "error", "num_rows", "path", "sizes")
@@ -190,8 +190,8 @@ def row_bytes(width: int) -> int:
 def make_centers(rows: Rows, count: int, seed: int = 0) -> NDArray[np.float32]:
     """Cluster unit rows (n, D) by spherical k-means on a sample; return (C, D') centres.
 
-    A centre is as long as its rows are like it on average, as their mean is. Codes describe what
-    rows differ by from it, which is then as little as possible.
+    A centre is the mean of its rows, so its length is their average cosine to it. Codes describe
+    the differences of rows from their centre, which the mean makes as small as possible.
     """
     faiss = _faiss()
     num = len(rows)
@@ -248,7 +248,7 @@ def bytes_of(lists: Iterable[MadeLists]) -> Iterator[bytes]:
 
 
 def num_lists(num_rows: int) -> int:
-    """So many that the comparison of the centres takes as long as that of a few lists."""
+    """Return how many lists to make: comparing the centres takes as long as searching a few."""
     return min(num_rows, round(2.0 * math.sqrt(num_rows)))
 
 
@@ -269,8 +269,8 @@ def _error(
 ) -> float:
     """Two standard deviations of a rough cosine; theorem 3.2 of Gao and Long 2024.
 
-    The product that codes tell is that of what is left of a row and of a query without the centre.
-    Dimensions that were added for the width are zero in both, and do not count.
+    Codes give the product of two differences: row minus centre, and query minus centre. Dimensions
+    that were added for the width are zero in both, and do not count.
     """
     squared = float(np.clip(np.average(lengths**2, weights=sizes), 0, 1)) if sizes.any() else 0.0
     row, query = 1 - squared, 1 + squared

@@ -1,8 +1,9 @@
-"""Poses along a rig and along time: what fills the gaps between measured ones.
+"""Fill the gaps between measured poses, from the rig's other cameras and from other instants.
 
-The post-processing of Humenberger et al. 2020 (rigs and image sequences), with centres instead of
-translations interpolated, gaps limited in seconds, and every filled pose marked and widened. What
-a filled pose is widened by, the constants below, is in metres: right for metric worlds.
+This is the post-processing of Humenberger et al. 2020 (rigs and image sequences), with three
+differences: camera centres are interpolated instead of translations, gaps are limited in seconds,
+and every filled pose says so and has a larger covariance. The constants below say how much larger.
+They are in metres, so they hold for metric worlds only.
 """
 
 from __future__ import annotations
@@ -27,29 +28,32 @@ from visloc.geometry import (
 )
 from visloc.types import PoseSource, Uncertainty
 
-# Unix times of 2001-01-01 and 2100-01-01 in seconds. Between them the unit follows from the size.
+# Unix times of 2001-01-01 and 2100-01-01 in seconds. A Unix time between them tells its unit by its
+# size.
 _FIRST_UNIX_S, _LAST_UNIX_S = 978_307_200, 4_102_444_800
 
-# Errors of a rig's calibration, as standard deviations about and along each axis.
+# Errors of a rig's calibration: standard deviations about each axis, and along each axis.
 _RIG_ORIENTATION_STD = math.radians(0.2)
 _RIG_POSITION_STD_M = 0.005
 _RIG_POSITION_STD_PER_M = 0.01  # of the distance between the two cameras
 
-# Unobserved motion of a device, as standard deviations about and along each axis. A car through a
-# bend in town (KITTI) accelerates by 2.2 m/s^2 and 0.2 rad/s^2 per axis (root mean square), mostly
-# towards the inside of the bend; a hand-held camera (7-Scenes) by 0.2 m/s^2 and 0.3 rad/s^2; a
-# walking person's head by about 3 m/s^2 with each step, but only by centimetres.
+# Unobserved motion of a device: standard deviations about each axis, and along each axis. For
+# comparison, root mean squares per axis:
+#   a car through a bend in town (KITTI): 2.2 m/s^2, mostly towards the inside, and 0.2 rad/s^2;
+#   a hand-held camera (7-Scenes): 0.2 m/s^2 and 0.3 rad/s^2;
+#   a walking person's head: about 3 m/s^2 with each step, but it moves by centimetres only.
 _ACCELERATION = 2.0  # m/s^2
 _ANGULAR_ACCELERATION = 1.0  # rad/s^2
-# The least speeds counted with: a walk, and a look around. Both of the above turn at 0.2 to 0.5.
+# Lower bounds of the speed: a walk, and a look around. The car and the camera above turn at 0.2 to
+# 0.5 rad/s.
 _WALKING_SPEED = 1.4  # m/s
 _TURNING_SPEED = 0.5  # rad/s
-# Counted with where a single pose leaves the speed unknown: a car in town.
+# The speed that is assumed where a single pose tells none: a car in town.
 _UNKNOWN_SPEED = 10.0  # m/s
-# The spread of an angle that nothing is known about: uniform between -pi and pi.
+# Standard deviation of an unknown angle: uniform between -pi and pi.
 _UNKNOWN_ANGLE_STD = math.pi / math.sqrt(3.0)
 
-# The longest gap between measured instants that is filled, seconds: by default, and at most.
+# The longest gap between measured instants that is filled, in seconds: the default and its limit.
 DEFAULT_MAX_GAP_S = 1.0
 MAX_GAP_S = 60.0
 
@@ -74,8 +78,8 @@ class Odometry:
 
     Attributes:
         rig_from_odometry: the pose, metres.
-        covariance: (6, 6) of ``rig_from_previous_rig``, the motion since the instant before, for
-            R <- Exp(w) R and t <- t + dt; None when unknown.
+        covariance: (6, 6) of the motion since the previous instant, ``rig_from_previous_rig``:
+            rotation (rad) then translation, for R <- Exp(w) R and t <- t + dt. None when unknown.
     """
 
     rig_from_odometry: Pose
@@ -84,14 +88,14 @@ class Odometry:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TracedPose:
-    """A pose with its uncertainty and what it rests on.
+    """A pose with its uncertainty and its origin.
 
     Attributes:
-        pose: ``device_from_world``: of a camera, or of a rig.
+        pose: ``device_from_world``, where the device is a camera or a rig.
         covariance: (6, 6) of rotation (rad) then translation, for R <- Exp(w) R and t <- t + dt.
-        source: what it rests on.
-        uncertainty: what ``covariance`` covers.
-        num_inliers: correspondences that agree with it; 0 when it was filled.
+        source: how it was found.
+        uncertainty: which errors ``covariance`` covers.
+        num_inliers: matches that agree with it; 0 for a filled pose.
     """
 
     pose: Pose
@@ -102,11 +106,11 @@ class TracedPose:
 
 
 def guess_time_unit(timestamps: Sequence[int]) -> TimeUnit | None:
-    """Tell the unit of timestamps that are Unix times of this century.
+    """Guess the unit of timestamps that are Unix times of this century.
 
     Returns:
-        The unit in which all of them lie between 2001 and 2100. None where there is none: counters
-        and times since a start, such as 0, 100, 200, look alike in every unit.
+        The unit in which all timestamps lie between 2001 and 2100; None if there is no such unit.
+        Counters and times since a start, such as 0, 100, 200, do not tell their unit.
     """
     if not timestamps:
         return None
@@ -121,18 +125,19 @@ def guess_time_unit(timestamps: Sequence[int]) -> TimeUnit | None:
 def fill_rig(
     instant: Mapping[str, TracedPose | None], cam_from_rig: Mapping[str, Pose]
 ) -> dict[str, TracedPose | None]:
-    """Give cameras of a rig without a pose that of the rig's best camera at the same instant.
+    """Fill the missing poses of a rig's cameras from its best camera at the same instant.
 
-    The best is the estimated one with most inliers; of equals, the first by sensor id.
+    The best camera is the one with most inliers among those with an estimated pose. Of equals, the
+    first by sensor id.
 
     Args:
-        instant: ``cam_from_world`` by sensor id, None where there is none.
-        cam_from_rig: where the rig's cameras sit.
+        instant: ``cam_from_world`` by sensor id; None for a missing pose.
+        cam_from_rig: the pose of each of the rig's cameras.
 
     Returns:
-        The same sensors. Filled poses have source RIG and the giver's covariance, carried over by
-        the rigid transform between the cameras, plus what its calibration may be wrong by. Sensors
-        that the rig lacks stay as they are, and all do when none was estimated.
+        The same sensors. A filled pose has source RIG. Its covariance is that of the best camera,
+        carried over by the rigid transform between both, plus the error of the rig's calibration.
+        Sensors that the rig lacks stay as they are. If no pose was estimated, nothing is filled.
     """
     estimated = {
         sensor: traced
@@ -153,23 +158,28 @@ def fill_rig(
 def fill_sequence(
     times_s: Sequence[float], poses: Sequence[TracedPose | None], max_gap_s: float
 ) -> list[TracedPose | None]:
-    """Fill instants without a pose from those before and after.
+    """Fill instants without a pose from the poses before and after them.
 
-    Between two poses that are at most ``max_gap_s`` apart, the pose is interpolated (source
-    INTERPOLATED). Elsewhere the nearest pose within ``max_gap_s`` is repeated (source NEAREST; of
-    two as near, the earlier). Beyond that, nothing is filled, and a filled pose fills no other.
+    The first rule that applies counts:
 
-    Neither is ever more certain than the poses it comes from, and to these is added what the
-    device may have done meanwhile, as independent deviations. Interpolated: an unknown
-    acceleration a, which bends the path by (a / 2) (t - t_a) (t_b - t) but to no more than the
-    nearest pose could be off; and an arc of a circle instead of its chord, where the device
-    turned. Nearest: a motion at the trajectory's own speed, at least that of a walk.
+    1. The instant lies between two poses that are at most ``max_gap_s`` apart: its pose is
+       interpolated (source INTERPOLATED).
+    2. The nearest pose is at most ``max_gap_s`` away: it is repeated (source NEAREST). Of two that
+       are equally near, the earlier one counts.
+    3. Otherwise nothing is filled.
+
+    A filled pose fills no other. Its covariance is at least that of the poses it comes from. The
+    motion that nobody saw is added to it as independent deviations:
+
+    - INTERPOLATED: an unknown acceleration a bends the path by (a / 2) (t - t_a) (t_b - t). This
+      deviation is at most that of repeating the nearest pose. Where the device turned, an arc of
+      a circle may replace its chord.
+    - NEAREST: a motion at the trajectory's own speed, or at that of a walk if that is faster.
 
     Args:
         times_s: seconds, strictly increasing. Unix times in nanoseconds lose digits as floats:
             count from the first instant.
-        poses: ``device_from_world`` of each instant, whatever they rest on; None where there is
-            none.
+        poses: ``device_from_world`` of each instant, of any source; None for a missing pose.
         max_gap_s: seconds; 0 fills nothing.
 
     Raises:
@@ -188,15 +198,15 @@ def fill_sequence(
 
 
 def interpolate_pose(a: Pose, b: Pose, share: float) -> Pose:
-    """Return the pose on the way from a to b, both ``device_from_world``.
+    """Interpolate between two poses, both ``device_from_world``.
 
-    The centre moves on a straight line, the rotation about one axis the shorter way (slerp:
-    Shoemake, "Animating Rotation with Quaternion Curves", SIGGRAPH 1985), both evenly.
+    The centre moves on a straight line. The rotation turns about one axis, the shorter way (slerp:
+    Shoemake, "Animating Rotation with Quaternion Curves", SIGGRAPH 1985). Both move evenly.
 
     Args:
-        a: where ``share`` is 0.
-        b: where ``share`` is 1.
-        share: of the way.
+        a: the pose where ``share`` is 0.
+        b: the pose where ``share`` is 1.
+        share: the part of the way from a to b.
     """
     w, *axis = Pose(b.rotation @ a.rotation.T, np.zeros(3)).rotation_wxyz  # w >= 0: the short way
     sine = math.hypot(*axis)
@@ -209,7 +219,7 @@ def interpolate_pose(a: Pose, b: Pose, share: float) -> Pose:
 
 
 def _carried(giver: TracedPose, cam_from_giver: Pose) -> TracedPose:
-    """The pose of a camera that sits rigidly beside one whose pose is known."""
+    """Return a camera's pose from that of another one, to which it is fixed."""
     pose = cam_from_giver @ giver.pose
     # R = S R_g and t = S t_g + u: an error (w, dt) of the giver arrives as (S w, S dt).
     jacobian = np.zeros((6, 6))
@@ -224,12 +234,12 @@ def _carried(giver: TracedPose, cam_from_giver: Pose) -> TracedPose:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Track:
-    """The posed instants of a sequence.
+    """The instants of a sequence that have a pose.
 
     Attributes:
-        times_s: when.
-        poses: as many.
-        speeds: (m/s, rad/s) from each to the next.
+        times_s: (n) seconds.
+        poses: (n) of these times.
+        speeds: (n - 1) in (m/s, rad/s), from each pose to the next.
     """
 
     times_s: list[float]
@@ -246,7 +256,7 @@ class _Track:
         return _Track([t for t, _ in posed], [p for _, p in posed], speeds)
 
     def at(self, time_s: float, reach_s: float) -> TracedPose | None:
-        """The pose at an instant between the posed ones, or beside."""
+        """Return the pose at a time by the rules of ``fill_sequence``."""
         following = bisect_left(self.times_s, time_s)
         beside = [k for k in (following - 1, following) if 0 <= k < len(self.poses)]
         if len(beside) == 2 and self.times_s[following] - self.times_s[following - 1] <= reach_s:
@@ -261,8 +271,8 @@ class _Track:
         since_s, until_s = time_s - self.times_s[before], self.times_s[before + 1] - time_s
         share = since_s / (since_s + until_s)
         pose = interpolate_pose(a.pose, b.pose, share)
-        # Errors that both share, such as the map's, do not average out: hence no (1 - share)^2
-        # and share^2, but whichever is wider along every direction.
+        # Errors that both poses share, such as the map's, do not average out. So the covariances
+        # are not weighted by (1 - share)^2 and share^2; the wider one counts in every direction.
         measured = _wider(_seen_from(pose, a), _seen_from(pose, b))
 
         short_s, long_s = sorted((since_s, until_s))
@@ -286,7 +296,7 @@ class _Track:
         return replace(known, covariance=covariance, source=PoseSource.NEAREST, num_inliers=0)
 
     def _speed_around(self, first: int, last: int) -> tuple[float, float]:
-        """The highest speeds (m/s, rad/s) between neighbours, from one further on either side."""
+        """Return the highest speeds (m/s, rad/s) among these poses and one more on either side."""
         around = self.speeds[max(first - 1, 0) : last + 1]
         if not around:
             return _UNKNOWN_SPEED, _TURNING_SPEED
@@ -323,7 +333,7 @@ def _angle(a: Pose, b: Pose) -> float:
 
 
 def _seen_from(device_from_world: Pose, other: TracedPose) -> NDArray[np.float64]:
-    """Covariance of (w, dc) of another pose, with w in this device's axes."""
+    """Return the covariance (6, 6) of another pose's rotation and centre, in this device's axes."""
     jacobian = np.eye(6)
     jacobian[:3, :3] = device_from_world.rotation @ other.pose.rotation.T
     return propagated(jacobian, center_covariance(other.pose, other.covariance))
@@ -334,7 +344,7 @@ def _independent(orientation_std: float, position_std: float) -> NDArray[np.floa
 
 
 def _wider(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A covariance that is at least ``a`` and ``b`` along every direction: a + (b - a)_+."""
+    """Return a covariance that is at least ``a`` and ``b`` in every direction: a + (b - a)_+."""
     scale = np.sqrt(np.diag(a) + np.diag(b))  # radians and metres must not be mixed
     units = np.outer(scale, scale)
     excess, axes = np.linalg.eigh((b - a) / units)

@@ -1,4 +1,4 @@
-"""What all answers are made of: models that hold NumPy arrays and poses, and send numbers."""
+"""The base of all answers: models that hold NumPy arrays and poses, and send numbers."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Merged:
-    """What became of two maps.
+    """The result of a merge.
 
     Attributes:
         a: the map whose frame it has.

@@ -42,7 +42,7 @@ LEFT_OUT = (PAIRS, IMPORTED_POINTS)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Kept:
-    """What stays of a map.
+    """The part of a map that stays.
 
     Attributes:
         images: (n,) photos.

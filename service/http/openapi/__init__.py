@@ -1,4 +1,4 @@
-"""What /openapi.json says: bodies, examples, problems."""
+"""The content of /openapi.json: bodies, examples, problems."""
 
 from __future__ import annotations
 

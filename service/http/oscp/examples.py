@@ -1,4 +1,4 @@
-"""What /openapi.json says of ``POST /geopose``, with examples that can be sent as they are."""
+"""The entry of ``POST /geopose`` in /openapi.json, with examples that can be sent as they are."""
 
 from __future__ import annotations
 

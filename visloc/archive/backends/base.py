@@ -1,4 +1,4 @@
-"""What the rules of a store need from the place that keeps the maps."""
+"""The backend of a store: the operations that its rules need from a folder or object storage."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What object storage has published: an index that is a few seconds old at most.
+"""The index of what object storage has published, at most a few seconds old.
 
 While the storage is away, the last index goes on. It is also kept in a file, for a start without
 the storage.
@@ -54,7 +54,7 @@ class PublishedIndex:
         self._asking = threading.Lock()
 
     def maps(self, age_s: float | None = None) -> Mapping[str, Published]:
-        """What is published, by id; the last index while the storage is away.
+        """The published maps by id; the last known index while the storage is away.
 
         Args:
             age_s: how old it may be; ``INDEX_S`` when None.
@@ -78,7 +78,7 @@ class PublishedIndex:
         return self._maps
 
     def of(self, map_id: str, age_s: float | None = None) -> Published:
-        """What is published of one map."""
+        """The published versions of one map."""
         return self.maps(age_s).get(map_id, Published())
 
     def current(self, map_id: str) -> str | None:
