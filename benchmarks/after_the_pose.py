@@ -29,8 +29,8 @@ from visloc.features import make_global_descriptor, make_local_features
 from visloc.geometry import Camera, Pose
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
-from visloc.localization.feature_cache import FeatureCache
 from visloc.localization.localizer import Localizer
+from visloc.localization.query.feature_cache import FeatureCache
 from visloc.matching.correspondences import Correspondences, settled
 from visloc.options import LocalizeOptions
 from visloc.pose.colmap import project

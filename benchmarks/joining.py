@@ -39,9 +39,7 @@ from mapping.cluster.workers import one_thread_here
 from mapping.frames.anchor import align_poses
 from mapping.importers.dataset import write_imported
 from mapping.importers.images import read as read_photos
-from mapping.methods.extending import with_late_photos
-from mapping.methods.look_alikes import without_look_alikes
-from mapping.methods.matching import (
+from mapping.methods.matching.stages import (
     Matches,
     Verification,
     find_fixed,
@@ -52,7 +50,9 @@ from mapping.methods.matching import (
 from mapping.methods.pieces import models_beside
 from mapping.methods.scenes import find_pairs, make_scene
 from mapping.methods.sfm_settings import SfmSettings
-from mapping.methods.sparse_model import MAPPER_CONFIGS, SfmPhoto, SparseModel
+from mapping.methods.sparse.extending import with_late_photos
+from mapping.methods.sparse.look_alikes import without_look_alikes
+from mapping.methods.sparse.model import MAPPER_CONFIGS, SfmPhoto, SparseModel
 from mapping.methods.undoing import reconstruct_places
 from mapping.pairing import PairSettings
 from mapping.sample import write_sample

@@ -22,7 +22,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-import mapping.methods.matching
+import mapping.methods.matching.stages
 from clients.evaluation.queries import read_queries
 from clients.evaluation.readers import FeatureReader
 from mapping.build.build import build_map
@@ -100,9 +100,9 @@ def matched_as_floats() -> Iterator[None]:
 
     with (
         patch.object(
-            mapping.methods.matching, "round_descriptors", lambda descriptors: descriptors
+            mapping.methods.matching.stages, "round_descriptors", lambda descriptors: descriptors
         ),
-        patch.object(mapping.methods.matching, "mutual_nearest_neighbours", nearest),
+        patch.object(mapping.methods.matching.stages, "mutual_nearest_neighbours", nearest),
     ):
         yield
 

@@ -45,8 +45,8 @@ from visloc.features.local.readymade import is_ready_made
 from visloc.geometry import Camera, Pose
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
-from visloc.localization.feature_cache import FeatureCache
 from visloc.localization.localizer import Localizer
+from visloc.localization.query.feature_cache import FeatureCache
 from visloc.options import LocalizeOptions
 from visloc.pose.colmap import project
 from visloc.retrieval.fusion import FUSION_OPERATORS, LateFusion

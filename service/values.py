@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from visloc.archive import Geodetic, MapOutline, SetOutline
 from visloc.errors import refuse
 from visloc.geometry import Camera
-from visloc.localization.judge import PlaceAnswer
+from visloc.localization.acceptance.judge import PlaceAnswer
 from visloc.options import Inference, LocalizeOptions
 from visloc.priors import NO_PRIORS, Priors
 from visloc.sequences.filling import Odometry, TimeUnit

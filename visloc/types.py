@@ -459,7 +459,8 @@ class InstantAnswer:
             both.
         seconds: wall time by stage, of all images together.
         scores: (k,) float32, how much each keypoint of the images speaks for the pose
-            (``visloc.localization.rivals.score``); empty when that is not known. Never sent.
+            (``visloc.localization.acceptance.rivals.score``); empty when that is not known. Never
+            sent.
         coarse: of a photo on its own that asked for it, the pose that retrieval alone tells;
             answers state it only when ``pose`` is None.
     """

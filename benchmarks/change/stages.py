@@ -14,10 +14,10 @@ from visloc.evaluation import Threshold, pose_error
 from visloc.features import GlobalDescriptor, make_global_descriptor
 from visloc.features.local.readymade import is_ready_made
 from visloc.geometry import Pose
-from visloc.localization.constraints import Constraints
-from visloc.localization.feature_cache import FeatureCache
-from visloc.localization.gates import Problem
+from visloc.localization.acceptance.gates import Problem
+from visloc.localization.geometry.constraints import Constraints
 from visloc.localization.localizer import Localizer
+from visloc.localization.query.feature_cache import FeatureCache
 from visloc.localization.solving import Look
 from visloc.options import LocalizeOptions
 from visloc.pose.centre import moved_origin

@@ -1,7 +1,7 @@
 """Learn the probability that a pose is right, and measure how well it holds.
 
     python -m benchmarks.probability teach MAPS_DIR MAP PHOTOS --foreign DIR [--room SEED]
-    python -m benchmarks.probability fit [--output visloc/localization/probability.json]
+    python -m benchmarks.probability fit [--output visloc/localization/acceptance/probability.json]
 
 ``teach`` asks one map about its own photos (``teachers.py``) and keeps the evidence in
 ``.training/poses/MAP.npz``; PHOTOS is the folder that holds the mapping photos, ``--foreign`` a
@@ -23,7 +23,7 @@ from benchmarks.probability.learning import Lessons, judged_by_others, learn, ta
 from benchmarks.probability.teachers import Taught, Teacher
 from visloc.archive import MapStore
 from visloc.features import make_local_features
-from visloc.localization.probability import MODEL_FILE
+from visloc.localization.acceptance.probability import MODEL_FILE
 
 app = typer.Typer(add_completion=False, no_args_is_help=True)
 _KEPT = Path(".training/poses")

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.localization.evidence import FEATURES
-from visloc.localization.probability import ProbabilityModel
+from visloc.localization.acceptance.evidence import FEATURES
+from visloc.localization.acceptance.probability import ProbabilityModel
 
 # Which way each feature may speak; a weight that the data would turn round becomes 0. Teachers are
 # not the world: without it, differences between two correlated features are taken for evidence.

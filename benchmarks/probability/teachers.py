@@ -25,9 +25,9 @@ from visloc.evaluation import pose_error
 from visloc.features.base import LocalFeatureExtractor
 from visloc.geometry import Camera, Pose
 from visloc.images import Photo, read_photo_file
-from visloc.localization.constraints import Constraints, MapGeometry
-from visloc.localization.evidence import SeenView, evidence_of
-from visloc.localization.gates import CONFIRMATIONS, GATES, Problem, first_refusal
+from visloc.localization.acceptance.evidence import SeenView, evidence_of
+from visloc.localization.acceptance.gates import CONFIRMATIONS, GATES, Problem, first_refusal
+from visloc.localization.geometry.constraints import Constraints, MapGeometry
 from visloc.localization.localizer import Localizer
 from visloc.options import LocalizeOptions
 from visloc.pose.views import MatchedView

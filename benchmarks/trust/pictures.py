@@ -18,8 +18,8 @@ from benchmarks.trust.maps import Places
 from benchmarks.trust.outcomes import Outcome, Query
 from visloc.geometry import Pose
 from visloc.images import read_photo_file
-from visloc.localization.evidence import SeenView, compared_landmarks
-from visloc.localization.gates import registration_for
+from visloc.localization.acceptance.evidence import SeenView, compared_landmarks
+from visloc.localization.acceptance.gates import registration_for
 from visloc.localization.solving import SeenImage
 
 _HEIGHT = 540

@@ -10,13 +10,13 @@ from mapping.build.settings import METHODS, BuildSettings
 from mapping.cluster.executors import EXECUTORS
 from mapping.cluster.storage import is_remote, lies_in, work_place
 from mapping.frames.anchor import MAX_DIRECTION_ERROR_DEG, known_positions
-from mapping.methods.adjustment import REFINABLE
 from mapping.methods.known_model import refuse_without_points
 from mapping.methods.retrieval_only import RETRIEVAL_ONLY
 from mapping.methods.rgbd import refuse_without_depth
 from mapping.methods.scenes import find_pairs, make_scene
 from mapping.methods.sfm_settings import POSES
-from mapping.methods.sparse_model import MAPPER_CONFIGS
+from mapping.methods.sparse.adjustment import REFINABLE
+from mapping.methods.sparse.model import MAPPER_CONFIGS
 from mapping.pairing import PAIRINGS
 from mapping.stages.networks import Networks
 from mapping.stages.photos import MappingPhoto

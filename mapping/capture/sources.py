@@ -12,7 +12,7 @@ from mapping.capture.frames import FilmedVideo, study_video, write_photos
 from mapping.capture.video import SUFFIXES, is_video
 from mapping.importers import ImportedImage, ImportedModel, read_model
 from mapping.importers.reading.photo_names import photo_size
-from mapping.methods.intrinsics import FROM_EXIF
+from mapping.methods.sparse.intrinsics import FROM_EXIF
 from mapping.progress import Progress
 from mapping.stages.work_folder import WorkFolder
 from visloc.errors import DatasetError, refuse

@@ -16,7 +16,7 @@ from mapping.report.model import tolerance_of
 from visloc.archive import Map
 from visloc.archive.schema import Doubt
 from visloc.geometry import Pose
-from visloc.localization.constraints import MapGeometry
+from visloc.localization.geometry.constraints import MapGeometry
 from visloc.pose.colmap import project
 
 _MOST_TRIED = 60

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from mapping.frames.anchor import MAX_SCALE_ERROR, align_poses
 from visloc.evaluation import pose_error
 from visloc.geometry import Camera, Pose, Similarity
-from visloc.localization.gates import registration_for
+from visloc.localization.acceptance.gates import registration_for
 from visloc.options import LocalizeOptions
 from visloc.pose.colmap import project
 from visloc.pose.refinement import LOSS_SCALE_PX

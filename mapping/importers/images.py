@@ -15,7 +15,7 @@ from PIL import ExifTags
 
 from mapping.importers.left_out import notes_on
 from mapping.importers.model import ImportedImage, ImportedModel
-from mapping.methods.intrinsics import FROM_EXIF
+from mapping.methods.sparse.intrinsics import FROM_EXIF
 from visloc.errors import InvalidInput, NotFound, TooLarge, VislocError, refuse
 from visloc.file_kinds import HEAD_BYTES, FileKind, file_kind
 from visloc.geometry import Camera

@@ -15,7 +15,7 @@ from mapping.own_test.trials import left_out_with
 from mapping.own_test.verdict import MOST_WRONG
 from mapping.report.held_out import spread_photos
 from visloc.archive import CoarseIndex, Map
-from visloc.localization.constraints import MapGeometry
+from visloc.localization.geometry.constraints import MapGeometry
 from visloc.sets.choosing import TileScore, plan
 from visloc.sets.coarse import photo_descriptor, ranked, score_without
 from visloc.sets.unheard import apart

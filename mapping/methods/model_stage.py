@@ -9,14 +9,14 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.methods.colmap_scene import Rigs
-from mapping.methods.extending import with_late_photos
-from mapping.methods.intrinsics import Doubt
-from mapping.methods.look_alikes import without_look_alikes
-from mapping.methods.matching import Matches, camera_values, pose_values
+from mapping.methods.matching.stages import Matches, camera_values, pose_values
 from mapping.methods.sfm_settings import SfmSettings
-from mapping.methods.sparse_model import MAPPER_CONFIGS, SfmPhoto, SparseModel
-from mapping.methods.triangulation import (
+from mapping.methods.sparse.colmap_scene import Rigs
+from mapping.methods.sparse.extending import with_late_photos
+from mapping.methods.sparse.intrinsics import Doubt
+from mapping.methods.sparse.look_alikes import without_look_alikes
+from mapping.methods.sparse.model import MAPPER_CONFIGS, SfmPhoto, SparseModel
+from mapping.methods.sparse.triangulation import (
     ADJUSTMENT,
     LOOK_ALIKES,
     MAPPING,

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from mapping.methods.matching import Matches, matches_among
-from mapping.methods.sparse_model import SparseModel
+from mapping.methods.matching.stages import Matches, matches_among
+from mapping.methods.sparse.model import SparseModel
 from visloc.errors import InvalidInput
 
 # Fewer photos localize too little to be a map of their own.

@@ -15,7 +15,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from mapping.methods.matching import camera_values, pose_values
+from mapping.methods.matching.stages import camera_values, pose_values
 from mapping.options import RGBD_PANEL, DepthScaleOption
 from mapping.progress import one_step
 from mapping.stages.context import BuildContext

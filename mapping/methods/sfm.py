@@ -16,15 +16,7 @@ from pydantic import JsonValue
 
 from mapping.frames.anchor import align_positions, known_positions
 from mapping.frames.anchor_error import place_error
-from mapping.methods.colmap_scene import Rigs
-from mapping.methods.intrinsics import (
-    CAMERAS,
-    CameraOrigin,
-    names_by_sensor,
-    notes_on,
-    origin_of,
-)
-from mapping.methods.matching import (
+from mapping.methods.matching.stages import (
     Matches,
     Verification,
     find_fixed,
@@ -33,11 +25,19 @@ from mapping.methods.matching import (
     outside_fixed,
 )
 from mapping.methods.model_stage import believed_pairs, make_model, with_latecomers, without_poses
-from mapping.methods.pair_agreement import doubts_about_poses
 from mapping.methods.pieces import models_beside
 from mapping.methods.scenes import find_pairs, make_scene
 from mapping.methods.sfm_settings import SfmSettings
-from mapping.methods.sparse_model import MAPPER_CONFIGS, SparseModel
+from mapping.methods.sparse.colmap_scene import Rigs
+from mapping.methods.sparse.intrinsics import (
+    CAMERAS,
+    CameraOrigin,
+    names_by_sensor,
+    notes_on,
+    origin_of,
+)
+from mapping.methods.sparse.model import MAPPER_CONFIGS, SparseModel
+from mapping.methods.sparse.pair_agreement import doubts_about_poses
 from mapping.progress import one_step
 from mapping.stages.camera_mask import CameraMask, where_in_picture
 from mapping.stages.context import BuildContext

@@ -11,8 +11,8 @@ from typing import Annotated
 import typer
 from pydantic import JsonValue
 
-from mapping.methods.adjustment import REFINABLE
-from mapping.methods.sparse_model import MAPPER_CONFIGS
+from mapping.methods.sparse.adjustment import REFINABLE
+from mapping.methods.sparse.model import MAPPER_CONFIGS
 from mapping.options import SFM_PANEL, Names
 from mapping.pairing import PAIRINGS, PairSettings
 from visloc.archive import Map, sha256_of

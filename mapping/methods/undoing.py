@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.methods.colmap_scene import Rigs
-from mapping.methods.contradictions import ModelPhoto, Places, find_places
-from mapping.methods.matching import Matches
-from mapping.methods.sparse_model import MapperConfig, SfmPhoto, SparseModel
-from mapping.methods.triangulation import reconstruct
+from mapping.methods.matching.stages import Matches
+from mapping.methods.sparse.colmap_scene import Rigs
+from mapping.methods.sparse.contradictions import ModelPhoto, Places, find_places
+from mapping.methods.sparse.model import MapperConfig, SfmPhoto, SparseModel
+from mapping.methods.sparse.triangulation import reconstruct
 from mapping.progress import Progress
 from mapping.stages.landmarks import rows_by_value
 from visloc.errors import InvalidInput

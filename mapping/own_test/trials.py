@@ -20,9 +20,9 @@ from mapping.report.held_out import match_held_out, spread_photos, taken_with
 from visloc.archive import Map
 from visloc.archive.schema import MAX_FACTOR, MAX_WRONG_SCORES, OwnTest, Score
 from visloc.geometry import Pose, center_covariance
-from visloc.localization.constraints import MapGeometry
-from visloc.localization.judge import TIE_ANGLE, TIE_REACH_SHARE
-from visloc.localization.viewpoints import Viewpoints
+from visloc.localization.acceptance.judge import TIE_ANGLE, TIE_REACH_SHARE
+from visloc.localization.geometry.constraints import MapGeometry
+from visloc.localization.geometry.viewpoints import Viewpoints
 from visloc.options import LocalizeOptions
 
 # How many photos are tried: a fifth of the map, within these limits. The test then takes a tenth of

@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from mapping.methods.contradictions import ModelPhoto, find_places
+from mapping.methods.sparse.contradictions import ModelPhoto, find_places
 from mapping.own_test.trials import OwnTestRun
 from mapping.stages.landmarks import View
 from visloc.archive import Map
 from visloc.archive.schema import Doubt, OwnTest
-from visloc.localization.constraints import MapGeometry
+from visloc.localization.geometry.constraints import MapGeometry
 
 # Shares that no map at hand that localizes well comes near: of 17, those with exact poses have all
 # photos back, and the weakest of look-alike hallways one wrong photo of 12. The painted sample with

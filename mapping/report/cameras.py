@@ -10,7 +10,7 @@ from typing import Literal
 
 from pydantic import JsonValue, ValidationError
 
-from mapping.methods.intrinsics import CAMERAS, CameraOrigin, Reason
+from mapping.methods.sparse.intrinsics import CAMERAS, CameraOrigin, Reason
 from visloc.archive import ImageRecord, Map
 
 # With more cameras than this, their lines are summed up.

@@ -22,8 +22,8 @@ from mapping.stages.work_folder import WorkFolder
 from visloc import __version__
 from visloc.archive import Map
 from visloc.geometry import Camera
-from visloc.localization.constraints import MapGeometry
-from visloc.localization.viewpoints import Viewpoints
+from visloc.localization.geometry.constraints import MapGeometry
+from visloc.localization.geometry.viewpoints import Viewpoints
 
 _MAX_CALIBRATION_BINS, _RUNS_PER_BIN = 10, 10
 # With fewer runs that failed, or succeeded, than this, what tells both apart is a guess.

@@ -13,7 +13,7 @@ from visloc.errors import refuse
 from visloc.geometry import Camera, Pose
 from visloc.images import FILE_LIMITS, Photo, read_photo_file, upright, with_mask
 from visloc.kapture import Dataset, FileRecord
-from visloc.localization.query_camera import GUESSED_FOCAL
+from visloc.localization.query.camera import GUESSED_FOCAL
 
 # More names than a note needs.
 _NAMED = 3

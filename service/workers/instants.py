@@ -12,7 +12,7 @@ from visloc.archive import Map
 from visloc.archive.places import anchor_rms
 from visloc.errors import InvalidInput, refuse
 from visloc.geometry import Pose
-from visloc.localization.constraints import Constraints
+from visloc.localization.geometry.constraints import Constraints
 from visloc.localization.localizer import Localizer
 from visloc.localization.solving import Look, SeenImage
 from visloc.options import LocalizeOptions

@@ -9,7 +9,7 @@ from dataclasses import replace
 from service.values import Localization
 from visloc.archive.places import similarity_on_earth
 from visloc.geometry import Similarity
-from visloc.localization.judge import (
+from visloc.localization.acceptance.judge import (
     STDS,
     TIE_REACH_SHARE,
     Tie,
@@ -24,7 +24,7 @@ from visloc.types import Refusal
 
 
 def judged(found: Sequence[Localization], priors: Priors = NO_PRIORS) -> tuple[int, Localization]:
-    """Choose one answer of several by ``visloc.localization.judge``, or refuse all as ambiguous.
+    """Choose one answer of several (``acceptance.judge``), or refuse all as ambiguous.
 
     Args:
         found: at least one, of maps, of sets, or of the tiles of one set. When one map gave several

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from service.values import PackedQuery, Query
 from visloc.features import LocalFeatureExtractor
 from visloc.images import ImageLimits, Photo, read_photo, with_mask
-from visloc.localization.feature_cache import FeatureCache
+from visloc.localization.query.feature_cache import FeatureCache
 from visloc.timing import timed
 from visloc.types import MaskedImage, QueryFeatures
 

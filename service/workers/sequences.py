@@ -9,7 +9,7 @@ from service.values import InstantJob, Localization, SequenceJob, check_order
 from service.workers.instants import Target, check_images, check_options, check_priors
 from service.workers.judging import settled
 from visloc.errors import inside, refuse
-from visloc.localization.judge import candidate, most_inliers_first
+from visloc.localization.acceptance.judge import candidate, most_inliers_first
 from visloc.localization.solving import SeenImage, Solved
 from visloc.priors import Priors
 from visloc.sequences.filling import TimeUnit, guess_time_unit

@@ -19,10 +19,10 @@ from visloc.features.local.readymade import (
 )
 from visloc.features.resolution import WorkingResolution
 from visloc.images import Photo
-from visloc.localization.constraints import MapGeometry
-from visloc.localization.feature_cache import find_features
-from visloc.localization.fingerprints import check_fingerprint
-from visloc.localization.query_camera import query_resolution, resolve_camera
+from visloc.localization.geometry.constraints import MapGeometry
+from visloc.localization.query.camera import query_resolution, resolve_camera
+from visloc.localization.query.feature_cache import find_features
+from visloc.localization.query.fingerprints import check_fingerprint
 from visloc.options import LocalizeOptions
 from visloc.sets.choosing import TileScore
 from visloc.sets.coarse import rank_tiles

@@ -21,7 +21,7 @@ from tests.fuzz.tiny_map import GLOBAL_DIM, LOCAL_DIM, write_tiny_map
 from visloc.archive import open_map
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera
-from visloc.localization.query_features import checked_global_descriptors, checked_local_features
+from visloc.localization.query.features import checked_global_descriptors, checked_local_features
 from visloc.types import QueryFeatures
 from visloc_api.v1 import localization_pb2 as pb2
 from visloc_api.words.photo import LocalizeRequest

@@ -21,22 +21,22 @@ from visloc.features.local.readymade import is_ready_made
 from visloc.features.networks.lightglue.load import make_lightglue
 from visloc.geometry import Camera
 from visloc.images import Photo
+from visloc.localization.acceptance.evidence import Shown
+from visloc.localization.acceptance.rivals import Proposed
 from visloc.localization.coarse import CoarsePoses
-from visloc.localization.constraints import Constraints, MapGeometry
-from visloc.localization.evidence import Shown
-from visloc.localization.feature_cache import FeatureCache, find_features
-from visloc.localization.fingerprints import check_fingerprint
-from visloc.localization.named_photos import NamedPhotos
+from visloc.localization.geometry.constraints import Constraints, MapGeometry
 from visloc.localization.photo_answer import photo_answer
 from visloc.localization.places import solve_photo
-from visloc.localization.query_camera import query_resolution, resolve_camera
-from visloc.localization.query_features import (
+from visloc.localization.query.camera import query_resolution, resolve_camera
+from visloc.localization.query.feature_cache import FeatureCache, find_features
+from visloc.localization.query.features import (
     checked_global_descriptors,
     checked_local_features,
     max_sent_keypoints,
 )
+from visloc.localization.query.fingerprints import check_fingerprint
+from visloc.localization.query.named_photos import NamedPhotos
 from visloc.localization.rematching import Rematching, seen_as_found
-from visloc.localization.rivals import Proposed
 from visloc.localization.sent_matches import SentMatches, sent_matches
 from visloc.localization.solving import (
     Look,

@@ -17,14 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.geometry import Pose
-from visloc.localization.constraints import Constraints, MapGeometry
-from visloc.localization.gates import (
+from visloc.localization.acceptance.gates import (
     Problem,
     enough_inliers,
     enough_of_the_matches,
     first_refusal,
 )
-from visloc.localization.rivals import Proposed
+from visloc.localization.acceptance.rivals import Proposed
+from visloc.localization.geometry.constraints import Constraints, MapGeometry
 from visloc.localization.solving import Look, Matches, SeenImage, Solved, solve_instant
 from visloc.options import DEFAULT_PRESET, PRESETS, LocalizeOptions
 from visloc.pose.generalized import GeneralizedPose, refine_generalized_pose

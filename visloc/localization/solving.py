@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from visloc.errors import VislocError, refuse
 from visloc.geometry import Camera, Pose
-from visloc.localization.camera_check import only_focal_length_contradicts
-from visloc.localization.constraints import Constraints, MapGeometry
-from visloc.localization.evidence import Shown
-from visloc.localization.gates import Problem, accepted, not_better_elsewhere
-from visloc.localization.judge import not_probable_enough
-from visloc.localization.rivals import Proposed, stronger_place
+from visloc.localization.acceptance.camera_check import only_focal_length_contradicts
+from visloc.localization.acceptance.evidence import Shown
+from visloc.localization.acceptance.gates import Problem, accepted, not_better_elsewhere
+from visloc.localization.acceptance.judge import not_probable_enough
+from visloc.localization.acceptance.rivals import Proposed, stronger_place
+from visloc.localization.geometry.constraints import Constraints, MapGeometry
 from visloc.localization.turning import REASONS_OF_TURNED_PHOTOS
 from visloc.options import LocalizeOptions, ReadAs, Solver
 from visloc.pose.centre import position_covariance, with_origin

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from visloc.errors import refuse
 from visloc.geometry import center_covariance, covariance_from_center, rotation_angle
-from visloc.localization.constraints import Constraints, MapGeometry
-from visloc.localization.gates import contradicts_priors, registration_for
-from visloc.localization.judge import not_probable_enough
+from visloc.localization.acceptance.gates import contradicts_priors, registration_for
+from visloc.localization.acceptance.judge import not_probable_enough
+from visloc.localization.geometry.constraints import Constraints, MapGeometry
 from visloc.localization.solving import (
     SeenImage,
     Solved,

@@ -12,7 +12,7 @@ from visloc.archive import SetOutline
 from visloc.archive.places import circles_of, located
 from visloc.errors import refuse
 from visloc.geodesy import ground_distances
-from visloc.localization.judge import measured_pose
+from visloc.localization.acceptance.judge import measured_pose
 from visloc.pose.centre import largest_std
 from visloc.priors import HEIGHT_REACH, POSE_PRIOR_STDS, REACH, Priors
 from visloc.sets.frame import down_in_set
@@ -61,9 +61,9 @@ def allowed_tiles(
     """Tell which tiles the priors allow.
 
     A tile is allowed if one of its photos may show what the device sees. The distances are those
-    of a single map (``visloc.localization.constraints``), measured from the bounding box of the
-    photos' centres: twice the viewing distance around a sphere, a quarter of the height around a
-    band.
+    of a single map (``visloc.localization.geometry.constraints``), measured from the bounding box
+    of the photos' centres: twice the viewing distance around a sphere, a quarter of the height
+    around a band.
 
     Args:
         outline: the set.

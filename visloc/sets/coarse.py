@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from visloc.archive import CoarseIndex, FingerprintRecord, Map, MapSet
 from visloc.errors import refuse
 from visloc.features import GlobalDescriptor, make_global_descriptor
-from visloc.localization.fingerprints import check_fingerprint
+from visloc.localization.query.fingerprints import check_fingerprint
 from visloc.retrieval.inverted import (
     InvertedFile,
     MadeLists,

@@ -12,7 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.archive import SetOutline
-from visloc.localization.judge import PlaceAnswer, candidate, measured_pose, most_inliers_first
+from visloc.localization.acceptance.judge import (
+    PlaceAnswer,
+    candidate,
+    measured_pose,
+    most_inliers_first,
+)
 from visloc.sets.choosing import MAX_SEARCHED, is_doubtful
 from visloc.types import Reason, Refusal
 

@@ -19,9 +19,9 @@ from visloc.evaluation import Threshold, median_errors_localized, pose_error
 from visloc.features import GlobalDescriptor, LocalFeatureExtractor
 from visloc.geometry import Pose
 from visloc.kapture import read_dataset
-from visloc.localization.constraints import MapGeometry
-from visloc.localization.feature_cache import FeatureCache
+from visloc.localization.geometry.constraints import MapGeometry
 from visloc.localization.localizer import Localizer
+from visloc.localization.query.feature_cache import FeatureCache
 from visloc.options import LocalizeOptions
 from visloc.retrieval.index import retrieve
 from visloc.types import Localized

@@ -27,7 +27,7 @@ from visloc.archive.schema import photo_file
 from visloc.errors import refuse
 from visloc.features.local.readymade import is_ready_made
 from visloc.kapture import Dataset
-from visloc.localization.fingerprints import check_fingerprint
+from visloc.localization.query.fingerprints import check_fingerprint
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.methods.matching import camera_values
+from mapping.methods.matching.stages import camera_values
 from mapping.stages.context import BuildContext
 from mapping.stages.local_features import LocalFeaturesSource
 from mapping.stages.networks import Networks

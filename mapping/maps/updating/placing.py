@@ -28,7 +28,7 @@ from visloc.archive import Map
 from visloc.errors import VislocError, refuse
 from visloc.evaluation import pose_error
 from visloc.geometry import Pose, Similarity
-from visloc.localization.gates import registration_for
+from visloc.localization.acceptance.gates import registration_for
 from visloc.options import LocalizeOptions
 from visloc.pose.reprojection import reprojection_errors
 from visloc.pose.views import MatchedView

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapping.methods.look_alikes import without_look_alikes
-from mapping.methods.matching import Matches
-from mapping.methods.sparse_model import MAPPER_CONFIGS, SfmPhoto
-from mapping.methods.triangulation import reconstruct
-from mapping.methods.two_views import fits_two_views
+from mapping.methods.matching.stages import Matches
+from mapping.methods.matching.two_views import fits_two_views
+from mapping.methods.sparse.look_alikes import without_look_alikes
+from mapping.methods.sparse.model import MAPPER_CONFIGS, SfmPhoto
+from mapping.methods.sparse.triangulation import reconstruct
 from samples.render import render_photo
 from samples.scene import Scene, make_room
 from samples.trajectories import mapping_trajectory, query_trajectory, stereo_rig

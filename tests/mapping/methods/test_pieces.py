@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapping.methods.matching import Matches
+from mapping.methods.matching.stages import Matches
 from mapping.methods.pieces import MIN_PHOTOS, models_beside
-from mapping.methods.sparse_model import MAPPER_CONFIGS, SfmPhoto, SparseModel
-from mapping.methods.triangulation import reconstruct
+from mapping.methods.sparse.model import MAPPER_CONFIGS, SfmPhoto, SparseModel
+from mapping.methods.sparse.triangulation import reconstruct
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera, Pose
 from visloc.pose.colmap import project

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mapping.methods.intrinsics import Doubt
 from mapping.methods.sfm import _with_their_groups, with_found_cameras
-from mapping.methods.sparse_model import SparseModel
+from mapping.methods.sparse.intrinsics import Doubt
+from mapping.methods.sparse.model import SparseModel
 from mapping.stages.landmarks import Observations, View
 from mapping.stages.photos import MappingPhoto
 from visloc.geometry import Camera, Pose

@@ -11,9 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from mapping.methods import undoing
-from mapping.methods.matching import Matches
-from mapping.methods.sparse_model import MAPPER_CONFIGS, SfmPhoto, SparseModel
-from mapping.methods.triangulation import reconstruct
+from mapping.methods.matching.stages import Matches
+from mapping.methods.sparse.model import MAPPER_CONFIGS, SfmPhoto, SparseModel
+from mapping.methods.sparse.triangulation import reconstruct
 from mapping.methods.undoing import reconstruct_places
 from visloc.errors import refuse
 from visloc.geometry import Camera, Pose

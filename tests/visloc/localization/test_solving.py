@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from visloc.errors import InvalidInput
 from visloc.evaluation import pose_error
 from visloc.geometry import Camera, Pose, center_covariance
-from visloc.localization.gates import registration_for
+from visloc.localization.acceptance.gates import registration_for
 from visloc.localization.solving import Matches, Solved, measured_pose, solve_instant
 from visloc.options import LocalizeOptions
 from visloc.pose.centre import with_origin

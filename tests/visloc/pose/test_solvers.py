@@ -467,7 +467,7 @@ def test_gravity_that_took_no_part_is_not_searched_without_again(
         calls.append(options)
         return estimate_generalized_pose(*arguments, **options)
 
-    monkeypatch.setattr("visloc.localization.gates.estimate_generalized_pose", counted)
+    monkeypatch.setattr("visloc.localization.acceptance.gates.estimate_generalized_pose", counted)
     image = hall.image(hall.matches(POSE, 150, 400, seed=7))
     priors = Priors(gravity=GravityPrior(POSE.rotation @ hall.down, np.radians(2.0)))
     for source, expected in ((CameraSource.GIVEN, 2), (CameraSource.GUESS, 1)):

@@ -67,7 +67,7 @@ def test_those_of_a_rig_and_of_its_halves(
         )
         for image in images
     ]
-    searched = record_searches(monkeypatch, "visloc.localization.gates")
+    searched = record_searches(monkeypatch, "visloc.localization.acceptance.gates")
     priors = Priors(pose=PosePrior(TRUTH, 0.01 * np.eye(6))) if with_prior else NO_PRIORS
     solved = solve_instant(images, place.geometry, LocalizeOptions(), priors)
     assert solved.pose is not None

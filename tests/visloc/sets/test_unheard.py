@@ -10,7 +10,7 @@ import pytest
 
 from tests.visloc.answers import localized
 from visloc.archive import SetOutline
-from visloc.localization.judge import PlaceAnswer
+from visloc.localization.acceptance.judge import PlaceAnswer
 from visloc.sets.unheard import apart, hard_to_find, left_open
 from visloc.types import InstantAnswer, Reason
 

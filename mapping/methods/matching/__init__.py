@@ -1,0 +1,1 @@
+"""Pairs of photos: matched, and verified by the geometry of two views."""

@@ -1,0 +1,1 @@
+"""Whether to believe a pose: the gates, the evidence, and other places that explain a photo too."""
