@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -110,3 +112,11 @@ def photos_of_another_room(tmp_path_factory: pytest.TempPathFactory) -> list[Pat
     folder = tmp_path_factory.mktemp("another_room")
     write_sample(folder, images=2, size=(256, 192), seed=1)
     return sorted(folder.rglob("*.jpg"))
+
+
+@pytest.fixture
+def interruptible() -> Iterator[None]:
+    """Let interrupts raise: processes in the background of a shell ignore them."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)

@@ -76,14 +76,6 @@ def test_threads_share_a_client_and_wait_at_the_same_time(url: str, service: Any
     assert all(answer.localized for answer in answers)
 
 
-@pytest.fixture
-def interruptible() -> Iterator[None]:
-    """Let interrupts raise: processes in the background of a shell ignore them."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
 @pytest.mark.usefixtures("interruptible")
 def test_an_interrupt_ends_a_waiting_call_and_the_client_goes_on(url: str, service: Any) -> None:
     has_arrived, may_answer = threading.Event(), threading.Event()

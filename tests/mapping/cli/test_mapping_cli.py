@@ -99,7 +99,7 @@ def test_the_folder_of_maps_can_come_from_the_environment(
 def test_verify_passes_a_map_as_published(run: Run, built_maps: Path) -> None:
     status, out, err = run("verify", "room", "--maps-dir", built_maps)
     assert (status, err) == (0, "")
-    assert "16 files, every byte as published" in out
+    assert "17 files, every byte as published" in out
     assert "sift, densevlad, localvlad: the same features as here" in out
 
 
@@ -303,7 +303,7 @@ def test_build_shows_each_stage_and_what_was_made(run: Run, sample: Path, tmp_pa
     ends = [line for line in err.splitlines() if not re.search(r" after \d+ s", line)]
     stages = [re.fullmatch(r"([a-z ]+): (\d+)/\2 in [\d.]+ s", line) for line in ends]
     assert [stage and stage[1] for stage in stages] == [
-        *("photos", "local features", "localvlad words", "localvlad", "depth"),
+        *("photos", "local features", "localvlad words", "localvlad", "depth", "own test"),
     ]
     opened = open_map(MapStore(tmp_path).folder("room"))
     assert opened.ref in out

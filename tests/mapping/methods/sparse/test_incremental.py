@@ -88,6 +88,7 @@ def test_large_models_are_told_more_often_and_come_out_alike(
         np.testing.assert_allclose(found["few"][name], center, atol=1e-4)
 
 
+@pytest.mark.usefixtures("interruptible")
 def test_ctrl_c_ends_an_adjustment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     told: Told = []
 
