@@ -6,6 +6,7 @@ import secrets
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -55,8 +56,9 @@ def _build_walk(dataset: Path, maps_dir: Path, **changes: object) -> Map:
 
 @pytest.fixture(scope="session")
 def build_sample(sample: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Map]:
-    """Build the map ``room`` of the sample by depth, with settings of its own."""
+    """Build the map ``room`` of the sample by depth, with settings of its own; only to be read."""
 
+    @cache
     def build(**settings: Any) -> Map:
         maps = tmp_path_factory.mktemp("maps of the sample")
         build_map(
