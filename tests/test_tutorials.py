@@ -30,8 +30,8 @@ TUTORIALS = {
     "your-app": 4,
 }
 WITHOUT_COMMANDS = "from-hosted"
-# They make maps.
-SLOW = ("beach", "building", "compare-features", "from-hloc", "robot")
+# They make maps, or start several services.
+SLOW = ("for-others", "beach", "building", "compare-features", "from-hloc", "robot")
 
 
 @pytest.fixture(scope="module")
