@@ -322,7 +322,7 @@ def speed(
     shutil.rmtree(work / "maps", ignore_errors=True)
     arguments = ["build", str(mapping), "--map", "speed", "--maps-dir", str(work / "maps")]
     started = last = time.perf_counter()
-    silence, counts = 0.0, ""
+    silence, counts, before = 0.0, "", ""
     with subprocess.Popen(
         [sys.executable, "-c", COMMAND, *arguments, "--method", "sfm", "--poses", "estimate"],
         stdout=subprocess.PIPE,
@@ -338,12 +338,14 @@ def speed(
             told = line.split(" after ")[0]
             if told != counts:
                 now = time.perf_counter()
-                silence, last, counts = max(silence, now - last), now, told
+                if now - last > silence:
+                    silence, before = now - last, counts
+                last, counts = now, told
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     typer.echo(
         f"{images} photos: {(time.perf_counter() - started) / 60:.1f} min, "
-        f"{(used.ru_utime + used.ru_stime) / 60:.1f} min of processors, "
-        f"{used.ru_maxrss / 2**20:.1f} GiB in the largest process, longest silence {silence:.0f} s"
+        f"{used.ru_maxrss / 2**20:.1f} GiB in the largest process; "
+        f"longest silence {silence:.0f} s, after '{before}'"
     )
 
 

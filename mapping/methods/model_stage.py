@@ -23,7 +23,7 @@ from mapping.methods.sparse.triangulation import (
     TRIANGULATION,
     triangulate,
 )
-from mapping.methods.undoing import reconstruct_places
+from mapping.methods.undoing import PLACES, reconstruct_places
 from mapping.progress import Progress
 from mapping.stages.context import BuildContext
 from mapping.stages.landmarks import Observations, View
@@ -178,7 +178,9 @@ def _make(inputs: _Inputs, rigs: Rigs, key: str, progress: Progress) -> None:
     settings, posed = inputs.settings, not inputs.settings.estimate_poses
     adjusted = (ADJUSTMENT,) if settings.refine else ()
     stages = (
-        (TRIANGULATION, *adjusted) if posed else (LOOK_ALIKES, MAPPING, ADJUSTMENT, TRIANGULATION)
+        (TRIANGULATION, *adjusted)
+        if posed
+        else (LOOK_ALIKES, MAPPING, ADJUSTMENT, TRIANGULATION, PLACES)
     )
 
     def compute() -> Item:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +15,13 @@ from mapping.methods.sparse.colmap_scene import Rigs
 from mapping.methods.sparse.contradictions import ModelPhoto, Places, find_places
 from mapping.methods.sparse.model import MapperConfig, SfmPhoto, SparseModel
 from mapping.methods.sparse.triangulation import reconstruct
-from mapping.progress import Progress
+from mapping.progress import ItemProgress, Progress
 from mapping.stages.landmarks import rows_by_value
 from visloc.errors import InvalidInput
 
 # At most so many models are made. Errors of the last one stay, and the map's own test reports them.
 _MOST_MODELS = 4
+PLACES = "look-alike places"
 
 
 def reconstruct_places(
@@ -34,7 +36,7 @@ def reconstruct_places(
 ) -> SparseModel:
     """Reconstruct, then repeat it without the pairs of photos that the model shows to be wrong.
 
-    Arguments and errors are those of ``reconstruct``.
+    Arguments and errors are those of ``reconstruct``. ``progress`` has one more stage, ``PLACES``.
 
     Args:
         describe: returns the descriptors (k, D) of a photo's keypoints, all with one scale.
@@ -42,7 +44,7 @@ def reconstruct_places(
     model = reconstruct(photos, rigs, matches, config, refine, work, progress)
     undone = 0
     for _ in range(_MOST_MODELS - 1):
-        kept = _without_two_places(photos, describe, matches, model)
+        kept = _without_two_places(photos, describe, matches, model, partial(progress, PLACES))
         if len(kept) == len(matches):
             break
         try:
@@ -59,8 +61,9 @@ def _without_two_places(
     describe: Callable[[int], NDArray[np.int8]],
     matches: Sequence[Matches],
     model: SparseModel,
+    progress: ItemProgress,
 ) -> list[Matches]:
-    number, places = _places_of(photos, describe, model)
+    number, places = _places_of(photos, describe, model, progress)
     return [
         pair
         for pair in matches
@@ -71,7 +74,10 @@ def _without_two_places(
 
 
 def _places_of(
-    photos: Sequence[SfmPhoto], describe: Callable[[int], NDArray[np.int8]], model: SparseModel
+    photos: Sequence[SfmPhoto],
+    describe: Callable[[int], NDArray[np.int8]],
+    model: SparseModel,
+    progress: ItemProgress,
 ) -> tuple[dict[int, int], Places]:
     """Return the order of the photos in a model, by their rows, and the places that they show."""
     observations = model.observations
@@ -93,4 +99,4 @@ def _places_of(
                 observations.rows[seen],
             )
         )
-    return number, find_places(placed, model.points)
+    return number, find_places(placed, model.points, progress)

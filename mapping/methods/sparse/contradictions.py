@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
+from mapping.progress import ItemProgress, not_told
 from mapping.stages.landmarks import View
 from visloc.pose.colmap import project
 from visloc.pose.distance import viewpoints_apart
@@ -104,16 +105,22 @@ class Places:
         return np.flatnonzero(np.isin(self.groups, sorted(smaller)))
 
 
-def find_places(photos: Sequence[ModelPhoto], points: NDArray[np.float64]) -> Places:
+def find_places(
+    photos: Sequence[ModelPhoto],
+    points: NDArray[np.float64],
+    progress: ItemProgress = not_told,
+) -> Places:
     """Group the photos of a model by the place that they seem to show.
 
     Args:
         photos: of one model.
         points: (P, 3) its points.
+        progress: in photos.
     """
     model = _Model(photos, points)
     expected, shown = [], []
     for row in range(len(photos)):
+        progress(row, len(photos))
         landmarks = model.expected(row)
         expected.append(landmarks)
         shown.append(landmarks[model.shown(row, landmarks)])
@@ -122,6 +129,7 @@ def find_places(photos: Sequence[ModelPhoto], points: NDArray[np.float64]) -> Pl
         _table(shown, len(points)),
         [model.near(row) for row in range(len(photos))],
     )
+    progress(len(photos), len(photos))
     weights = (correlations + _SLACK) * np.minimum(counts, _FULL_WEIGHT) / _FULL_WEIGHT
     groups = _contracted(len(photos), pairs, weights)
     return Places(
