@@ -13,6 +13,8 @@ from visloc.archive.checks import read_record
 from visloc.archive.schema import Record
 
 GNSS_FILE = "gnss.json"
+# About 90 MB. A larger file could not be read again (``read_record``).
+MAX_FIXES = 500_000
 
 
 # A dataclass takes a third of the memory of a pydantic model, and a receiver may tell millions.
@@ -69,6 +71,13 @@ class Fixes(Record):
             # What both have of one receiver and time is the same, and one.
             fixes=tuple({**known, **{(fix.timestamp, fix.receiver): fix for fix in more}}.values()),
         )
+
+    def thinned(self, most: int = MAX_FIXES) -> Fixes:
+        """Return at most so many fixes: of more, every second, third and so on of each receiver."""
+        if len(self.fixes) <= most:
+            return self
+        ordered = sorted(self.fixes, key=lambda fix: (fix.receiver, fix.timestamp))
+        return self.model_copy(update={"fixes": tuple(ordered[:: -(-len(ordered) // most)])})
 
     def _fits(self, name: str, other: Fixes, known: dict[tuple[int, str], GnssFix]) -> bool:
         if name in self.receivers and self.receivers[name] != other.receivers[name]:
