@@ -254,6 +254,7 @@ def _unit_vector(part: str, vector: NDArray[np.float64]) -> NDArray[np.float64]:
 def _unusable(prior: str, part: str | None, expected: str, got: object) -> VislocError:
     return refuse(
         f"priors.{prior}",
+        "the prior is not valid",  # by itself; the codes' own sentences are about a prior and a map
         field=f"priors.{prior}" if part is None else f"priors.{prior}.{part}",
         expected=expected,
         got=str(got)[:100],

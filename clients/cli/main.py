@@ -72,7 +72,8 @@ def image(
         str | None,
         typer.Option(
             metavar="JSON_OR_FILE",
-            help="What is known of the pose: position, height, pose or gravity, as in the API.",
+            help="What is known of the pose: position, height, pose, gravity or gnss, as in the "
+            "API.",
         ),
     ] = None,
     mask: Annotated[

@@ -85,7 +85,7 @@ def content_of(opened: Map) -> MapContent:
         descriptor_scale=scale,
         own_test=manifest.parts.own_test,
         index=IndexKind.IVF if opened.has_index else IndexKind.AUTO,
-        fixes=read_fixes(opened),
+        fixes=read_fixes(opened.path, opened.manifest.files),
     )
 
 

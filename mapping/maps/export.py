@@ -282,7 +282,7 @@ def _export_kapture(opened: Map, output: Path) -> tuple[str, ...]:
 
 def _fixes(opened: Map) -> tuple[dict[str, Sensor], tuple[GnssRecord, ...]]:
     """Return the GNSS receivers of a map and their fixes, as kapture has them."""
-    kept = read_fixes(opened)
+    kept = read_fixes(opened.path, opened.manifest.files)
     if kept is None:
         return {}, ()
     taken = {name: f"gnss {name}" if name in opened.cameras else name for name in kept.receivers}

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
 
-from pydantic import Field, model_validator
+from pydantic import Field, FiniteFloat, model_validator
 
 from visloc.archive.checks import read_record
-from visloc.archive.reader import Map
 from visloc.archive.schema import Record
 
 GNSS_FILE = "gnss.json"
+# About 90 MB. A larger file could not be read again (``read_record``).
+MAX_FIXES = 500_000
 
 
-class GnssFix(Record):
+# A dataclass takes a third of the memory of a pydantic model, and a receiver may tell millions.
+@dataclass(frozen=True, slots=True)
+class GnssFix:
     """One fix, with the numbers of kapture's ``records_gnss.txt``.
 
     Attributes:
@@ -26,13 +32,13 @@ class GnssFix(Record):
         dop: dilution of precision, 0 when unknown.
     """
 
-    timestamp: int
+    timestamp: Annotated[int, Field(ge=-(2**63), lt=2**63)]
     receiver: Annotated[str, Field(max_length=1000)]
-    x: float
-    y: float
-    z: float
-    utc: float
-    dop: float
+    x: FiniteFloat
+    y: FiniteFloat
+    z: FiniteFloat
+    utc: FiniteFloat
+    dop: FiniteFloat
 
 
 class Fixes(Record):
@@ -42,9 +48,11 @@ class Fixes(Record):
     fixes: tuple[GnssFix, ...]
 
     @model_validator(mode="after")
-    def _names_its_receivers(self) -> Fixes:
+    def _is_consistent(self) -> Fixes:
         if not {fix.receiver for fix in self.fixes} <= self.receivers.keys():
             raise ValueError("a fix is of a receiver that is not listed")
+        if len({(fix.timestamp, fix.receiver) for fix in self.fixes}) < len(self.fixes):
+            raise ValueError("two fixes are of one receiver and time")
         return self
 
     def joined(self, other: Fixes) -> Fixes:
@@ -54,7 +62,7 @@ class Fixes(Record):
             name: name if self._fits(name, other, known) else self._free(name, other)
             for name in other.receivers
         }
-        more = (fix.model_copy(update={"receiver": renamed[fix.receiver]}) for fix in other.fixes)
+        more = (replace(fix, receiver=renamed[fix.receiver]) for fix in other.fixes)
         return Fixes(
             receivers={
                 **self.receivers,
@@ -63,6 +71,13 @@ class Fixes(Record):
             # What both have of one receiver and time is the same, and one.
             fixes=tuple({**known, **{(fix.timestamp, fix.receiver): fix for fix in more}}.values()),
         )
+
+    def thinned(self, most: int = MAX_FIXES) -> Fixes:
+        """Return at most so many fixes: of more, every second, third and so on of each receiver."""
+        if len(self.fixes) <= most:
+            return self
+        ordered = sorted(self.fixes, key=lambda fix: (fix.receiver, fix.timestamp))
+        return self.model_copy(update={"fixes": tuple(ordered[:: -(-len(ordered) // most)])})
 
     def _fits(self, name: str, other: Fixes, known: dict[tuple[int, str], GnssFix]) -> bool:
         if name in self.receivers and self.receivers[name] != other.receivers[name]:
@@ -77,12 +92,14 @@ class Fixes(Record):
         return f"{name}-{number}"
 
 
-def read_fixes(opened: Map) -> Fixes | None:
+def read_fixes(folder: Path, files: Mapping[str, Any]) -> Fixes | None:
     """Return the fixes that a map keeps; None for a map without any.
+
+    Args:
+        folder: of the map.
+        files: by name, those of its manifest.
 
     Raises:
         MapCorrupt: ``map.json`` when the file is damaged.
     """
-    if GNSS_FILE not in opened.manifest.files:
-        return None
-    return read_record(opened.path, GNSS_FILE, Fixes)
+    return read_record(folder, GNSS_FILE, Fixes) if GNSS_FILE in files else None

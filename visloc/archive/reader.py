@@ -21,6 +21,7 @@ from visloc.archive.checks import (
     read_model,
     read_record,
 )
+from visloc.archive.gnss import read_fixes
 from visloc.archive.index_files import IndexFiles, check_lists, index_files, open_index
 from visloc.archive.places import GeoCircle, circle_of, down_of
 from visloc.archive.schema import (
@@ -289,6 +290,7 @@ def verify_map(folder: Path) -> Map:
     for name, good in fine.items():
         if not good:
             raise refuse("map.range", field=str(folder / name))
+    read_fixes(folder, opened.manifest.files)  # nothing else reads them before they are needed
     return opened
 
 

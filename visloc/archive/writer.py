@@ -51,7 +51,7 @@ def write_map(folder: Path, content: MapContent, *, map_id: str, version: str, c
     files, landmarks = Files(folder), content.landmarks
     _write_images(files, content)
     if content.fixes is not None:
-        files.write_json(GNSS_FILE, content.fixes.model_dump())
+        files.write_json(GNSS_FILE, content.fixes.thinned().model_dump())
     _write_landmarks(files, landmarks)
     keypoint_step = _write_keypoints(files, landmarks.keypoints, content.cameras)
     scale = _write_descriptors(

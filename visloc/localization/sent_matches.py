@@ -16,6 +16,7 @@ from visloc.types import LocalFeatures, QueryFeatures
 
 # A map may round keypoints to steps of a power of two pixels; else they are kept as they were.
 _EXACT_PX = 0.01
+_NO_MATCHES = np.empty((0, 3))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,16 +74,18 @@ def sent_matches(features: QueryFeatures, local: LocalFeatures) -> SentMatches |
         return None
     by_photo = {}
     for name, sent in features.matches.items():
-        expected = f"(k, 3): a row of the {len(local)} keypoints, and x, y in the mapping photo"
+        # A keypoint has one match in a photo. Without a limit, a request of 20 MB could name so
+        # many pairs that comparing their descriptors takes gigabytes.
+        fits = sent.ndim == 2 and sent.shape[1] == 3 and len(sent) <= len(local)
         with np.errstate(invalid="ignore"):  # signalling NaN
-            rows = sent.astype(np.float64)
-        fine = rows.ndim == 2 and rows.shape[1] == 3
-        if not fine or not _usable(rows, len(local)):
+            rows = sent.astype(np.float64) if fits else _NO_MATCHES
+        if not fits or not _usable(rows, len(local)):
             raise refuse(
                 "features.matches",
                 field=f"features.matches.{name[:100]}",
-                expected=expected,
-                got="other numbers" if fine else str(rows.shape),
+                expected=f"(k, 3), of k up to {len(local)}: a row of the {len(local)} keypoints, "
+                "and x, y in the mapping photo",
+                got="other numbers" if fits else str(sent.shape),
             )
         by_photo[name] = rows
     return SentMatches(local, by_photo)

@@ -127,7 +127,13 @@ def in_threads(work: Callable[[S], T], items: Iterable[S]) -> list[T]:
     threads = torch.get_num_threads()
     if threads == 1:
         return [work(item) for item in items]
-    return list(_single_threads(threads).map(work, items))
+    turns = threading.Semaphore(threads)  # there may be more threads
+
+    def work_in_turn(item: S) -> T:
+        with turns:
+            return work(item)
+
+    return list(_single_threads(threads).map(work_in_turn, items))
 
 
 def start_threads() -> None:
@@ -142,15 +148,16 @@ def start_threads() -> None:
         _single_threads(threads)
 
 
-_pools: dict[int, ThreadPoolExecutor] = {}
-_pools_lock = threading.Lock()
+# The number of threads changes from one task of the service to the next. So those of the largest
+# number are kept for all: threads for each number would be hundreds on a machine of many cores.
+_pool: tuple[int, ThreadPoolExecutor] | None = None
+_pool_lock = threading.Lock()
 
 
 def _forget_threads() -> None:
     """A forked child has none of its parent's threads."""
-    global _pools_lock
-    _pools.clear()
-    _pools_lock = threading.Lock()
+    global _pool, _pool_lock
+    _pool, _pool_lock = None, threading.Lock()
 
 
 if hasattr(os, "register_at_fork"):  # Windows does not fork
@@ -158,10 +165,12 @@ if hasattr(os, "register_at_fork"):  # Windows does not fork
 
 
 def _single_threads(count: int) -> ThreadPoolExecutor:
-    with _pools_lock:
-        if count not in _pools:
-            _pools[count] = _start_single_threads(count)
-        return _pools[count]
+    """Return at least so many threads."""
+    global _pool
+    with _pool_lock:
+        if _pool is None or _pool[0] < count:
+            _pool = count, _start_single_threads(count)
+        return _pool[1]
 
 
 def _start_single_threads(count: int) -> ThreadPoolExecutor:

@@ -63,6 +63,34 @@ def test_a_rotation_whose_length_overflows_is_out_of_range_without_a_warning(fol
     assert refusal(folder) == "map.range"
 
 
+_RECEIVER = '"receivers": {"gps": ["EPSG:4326"]}'
+_FIX = '{"timestamp": 1, "receiver": "gps", "x": 8, "y": 48, "z": 4, "utc": 0, "dop": %s}'
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{",
+        f'{{{_RECEIVER}, "fixes": [{_FIX % "NaN"}]}}',
+        f'{{"receivers": {{}}, "fixes": [{_FIX % 1}]}}',
+        f'{{{_RECEIVER}, "fixes": [{_FIX % 1}, {_FIX % 2}]}}',
+        f'{{{_RECEIVER}, "fixes": [{_FIX.replace("1", str(2**63)) % 1}]}}',
+    ],
+)
+def test_fixes_that_no_receiver_gave_are_found_though_no_query_reads_them(
+    folder: Path, text: str
+) -> None:
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["files"]["gnss.json"] = {}
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    (folder / "gnss.json").write_text(f'{{{_RECEIVER}, "fixes": [{_FIX % 1}]}}')
+    make_right(folder, "gnss.json")
+    verify_map(folder)
+    (folder / "gnss.json").write_text(text)
+    make_right(folder, "gnss.json")
+    assert refusal(folder) == "map.json"
+
+
 @pytest.mark.parametrize("name", ["a" * 300, "a\0b", "\ud800", "images.json/x", "x" * 5000])
 def test_a_listed_name_that_no_file_can_have_is_refused(folder: Path, name: str) -> None:
     manifest = json.loads((folder / "manifest.json").read_text())

@@ -80,6 +80,7 @@ def test_matches_beside_keypoints_of_the_map_say_nothing(localizer: Localizer) -
     "wrong",
     [
         np.zeros((4, 2)),
+        np.zeros((100_000, 3)),  # more than there are keypoints
         np.zeros(3),
         np.array([[-1.0, 5, 5]]),
         np.array([[0.5, 5, 5]]),

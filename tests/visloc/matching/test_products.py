@@ -106,17 +106,42 @@ assert os.waitpid(child, 0)[1] == 0
 
 
 def test_threads_that_ask_at_the_same_time_share_one_set_of_them() -> None:
-    torch_threads = torch.get_num_threads()
-    torch.set_num_threads(3)
-    try:
-        started = [threading.Thread(target=products.start_threads) for _ in range(8)]
-        for thread in started:
-            thread.start()
-        for thread in started:
-            thread.join()
-        assert products._pools.keys() >= {3}
-        assert sum(t.name.startswith("matching") for t in threading.enumerate()) <= 3 * len(
-            products._pools
-        )
-    finally:
-        torch.set_num_threads(torch_threads)
+    script = """
+import threading, torch
+from visloc.matching.products import start_threads
+torch.set_num_threads(3)
+asking = [threading.Thread(target=start_threads) for _ in range(8)]
+for thread in asking:
+    thread.start()
+for thread in asking:
+    thread.join()
+assert sum(each.name.startswith("matching") for each in threading.enumerate()) == 3
+"""
+    subprocess.run([sys.executable, "-W", "ignore", "-c", script], check=True)
+
+
+def test_no_more_threads_work_than_torch_uses_and_none_are_started_for_fewer() -> None:
+    script = """
+import threading, time, torch
+from visloc.matching.products import in_threads
+working, most, lock = 0, 0, threading.Lock()
+
+def work(item):
+    global working, most
+    with lock:
+        working += 1
+        most = max(most, working)
+    time.sleep(0.01)
+    with lock:
+        working -= 1
+    return item
+
+for count in (4, 3, 2, 4):
+    torch.set_num_threads(count)
+    most = 0
+    assert in_threads(work, range(12)) == list(range(12))
+    assert most <= count, (most, count)
+    assert torch.get_num_threads() == count
+assert sum(each.name.startswith("matching") for each in threading.enumerate()) == 4
+"""
+    subprocess.run([sys.executable, "-W", "ignore", "-c", script], check=True)

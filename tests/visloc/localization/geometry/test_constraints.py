@@ -609,3 +609,27 @@ def test_only_photos_within_the_area_are_said_to_be_retrieved(
     assert max(similarities) == pytest.approx(
         max(r.similarities["kapture:B"] for r in everywhere.evidence.retrieved)
     )
+
+
+@pytest.mark.parametrize(
+    ("field", "latitude", "longitude", "accuracies"),
+    [
+        ("latitude", np.nan, 8.0, (5.0,)),
+        ("latitude", 90.1, 8.0, (5.0,)),
+        ("longitude", 48.0, -180.1, (5.0,)),
+        ("accuracy", 48.0, 8.0, (0.0,)),
+        ("accuracy", 48.0, 8.0, (np.nan,)),
+        ("accuracy", 48.0, 8.0, (np.inf,)),
+        ("altitude", 48.0, 8.0, (5.0, np.inf, 5.0)),
+        ("vertical_accuracy", 48.0, 8.0, (5.0, 400.0)),
+        ("vertical_accuracy", 48.0, 8.0, (5.0, None, 5.0)),
+        ("vertical_accuracy", 48.0, 8.0, (5.0, 400.0, -1.0)),
+    ],
+)
+def test_a_fix_that_no_receiver_gives_is_refused_for_what_is_wrong_with_it(
+    field: str, latitude: float, longitude: float, accuracies: Any
+) -> None:
+    with pytest.raises(InvalidInput) as caught:
+        GnssPrior(latitude, longitude, *accuracies)
+    assert caught.value.field == f"priors.gnss.{field}"
+    assert "Earth" not in caught.value.message
