@@ -157,9 +157,9 @@ def _retrieval(opened: Map) -> dict[str, str]:
 def _world(opened: Map) -> str:
     """Return whether a unit is a metre, and what fixed the frame."""
     world = opened.manifest.world
-    unit = "metric" if world.metric else "not metric"
+    kind, unit = ("metric", "m") if world.metric else ("not metric", "units")
     if world.anchor is None:
-        return unit
+        return kind
     anchor = world.anchor
     fixed_by = {
         "dataset": "the poses of the dataset",
@@ -169,8 +169,8 @@ def _world(opened: Map) -> str:
         "correspondences": f"{anchor.images} given points" if anchor.images else "a given place",
         "none": "nothing: the frame is arbitrary",
     }[anchor.kind]
-    off = "" if anchor.rms is None else f", which agree within {anchor.rms:.2g} (RMS)"
-    return f"{unit}, fixed by {fixed_by}{off}"
+    off = "" if anchor.rms is None else f", which agree within {anchor.rms:.2g} {unit} (RMS)"
+    return f"{kind}, fixed by {fixed_by}{off}"
 
 
 def gravity_text(down: NDArray[np.float64] | None) -> str:

@@ -239,8 +239,9 @@ class MapStore:
         return map_id, version
 
     def _unknown_map(self, map_id: str) -> VislocError:
-        known = ", ".join(self.ids()) or "none"
-        return refuse("map.unknown", field="map", expected=f"one of {known}", got=map_id)
+        known = ", ".join(self.ids())
+        expected = f"one of {known}" if known else "a map that exists; there is none yet"
+        return refuse("map.unknown", field="map", expected=expected, got=map_id)
 
     def _manifests(self, refs: Sequence[tuple[str, str]]) -> Iterator[AnyManifest]:
         """The manifests of versions; raises NotFound and MapCorrupt in their turn."""

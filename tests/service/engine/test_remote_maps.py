@@ -166,7 +166,8 @@ def test_an_empty_place_has_no_maps(store: RemoteMapStore) -> None:
     assert store.versions("room") == []
     with pytest.raises(NotFound) as caught:
         store.folder("room")
-    assert (caught.value.code, caught.value.expected) == ("map.unknown", "one of none")
+    assert caught.value.code == "map.unknown"
+    assert caught.value.expected == "a map that exists; there is none yet"
 
 
 def test_a_published_map_is_in_the_storage_as_in_a_folder(
