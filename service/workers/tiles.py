@@ -128,11 +128,12 @@ class TileRanker:
         found = decoded.found if self._resolution is not None else {}
         if not isinstance(photo, Photo) or self._extractor is None or allowed is None:
             return ()
-        for turned in (0, *QUARTERS):
-            step()
-            local = self._photo_features(photo, self._extractor, found, options, turned)
-            for each in rank_tiles(self._set, local, allowed) if len(local) > 0 else ():
-                best[each.tile] = max(each.score, best.get(each.tile, each.score))
+        with timed(decoded.seconds, "turns"):
+            for turned in (0, *QUARTERS):
+                step()
+                local = self._photo_features(photo, self._extractor, found, options, turned)
+                for each in rank_tiles(self._set, local, allowed) if len(local) > 0 else ():
+                    best[each.tile] = max(each.score, best.get(each.tile, each.score))
         ranked = sorted(best, key=lambda tile: -best[tile])
         return tuple(TileScore(tile, best[tile]) for tile in ranked)
 

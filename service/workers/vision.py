@@ -199,7 +199,7 @@ class Vision:
                     decoded.found,
                     self._step,
                 )
-            seconds = {**look.evidence.seconds, "turns": perf_counter() - began}
+            seconds = summed(look.evidence.seconds, {"turns": perf_counter() - began})
             if turned:
                 self._step()
                 any_turned = True
