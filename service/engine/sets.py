@@ -50,7 +50,7 @@ from visloc.sets.choosing import (
 from visloc.sets.frame import answer_in_set, priors_in_tile, scaled_device
 from visloc.sets.unheard import hard_to_find, left_open
 from visloc.timing import summed
-from visloc.types import Near, Refusal
+from visloc.types import Near, Reason, Refusal
 
 # Codes of errors of reaching a map, not of the map itself, begin with one of these.
 _OF_A_MAP = ("map.", "maps.")
@@ -149,7 +149,7 @@ class SetSearch:
                 return found
             left = replace(job, refused=refused)
             _, turned = await self.search(outline, choice, photos, partial(ask, left))
-            if turned.answer.pose is not None or _has_rivals(turned):
+            if turned.answer.pose is not None or _is_ambiguous(turned):
                 return turned
             return _with_turns(found, perf_counter() - began)
 
@@ -264,9 +264,9 @@ def _in_turn(
     yield hard_to_find(outline, doubtful, choice.without([row for row, _ in found]))
 
 
-def _has_rivals(found: Localization) -> bool:
+def _is_ambiguous(found: Localization) -> bool:
     refusal = found.answer.refusal
-    return refusal is not None and len(refusal.candidates) > 1
+    return refusal is not None and refusal.reason is Reason.AMBIGUOUS
 
 
 def _with_turns(found: Localization, seconds: float) -> Localization:
