@@ -18,7 +18,15 @@ from visloc.options import Inference, LocalizeOptions
 from visloc.priors import NO_PRIORS, Priors
 from visloc.sequences.filling import Odometry, TimeUnit
 from visloc.sets.choosing import TileScore
-from visloc.types import InstantAnswer, MaskedImage, Near, QueryFeatures, RigPose, RigSensor
+from visloc.types import (
+    InstantAnswer,
+    MaskedImage,
+    Near,
+    QueryFeatures,
+    Refusal,
+    RigPose,
+    RigSensor,
+)
 
 # The sensor of a photo that comes without a rig.
 ONLY_SENSOR = "camera"
@@ -63,6 +71,7 @@ class RigJob:
         rig: None for a photo on its own.
         ypr: also return the GeoPose as angles.
         debug: also return the matches; for a photo on its own.
+        refused: of a photo on its own that was searched as it was sent; other turns are left.
     """
 
     maps: Where
@@ -73,6 +82,7 @@ class RigJob:
     priors: Priors = NO_PRIORS
     ypr: bool = False
     debug: bool = False
+    refused: Refusal | None = None
 
 
 def photo_job(

@@ -16,6 +16,7 @@ from service.workers.pool import Workers
 from service.workers.tasks import Vision
 from visloc.options import LocalizeOptions
 from visloc.sets.choosing import TileScore
+from visloc.types import Refusal
 
 T = TypeVar("T")
 
@@ -86,17 +87,18 @@ class SetPhotos:
     def any_decoded(self) -> bool:
         return any(isinstance(query, PackedQuery) for query in self.queries)
 
-    async def rank(self, allowed: NDArray[np.bool_] | None) -> list[tuple[TileScore, ...]]:
+    async def rank(
+        self, allowed: NDArray[np.bool_] | None, refused: Refusal | None = None
+    ) -> list[tuple[TileScore, ...]]:
         """Decode the photos if they are not decoded yet, and rank tiles by each.
 
         Args:
             allowed: (T,) the tiles to rank; None to rank none.
+            refused: of the photo as it was sent, to rank tiles by other turns of it.
         """
+        asked = self._set, self._options, allowed, self._submitted, refused
         ranked = await together(
-            self._workers.run(
-                Vision.rank_tiles, query, self._set, self._options, allowed, self._submitted
-            )
-            for query in self.queries
+            self._workers.run(Vision.rank_tiles, query, *asked) for query in self.queries
         )
         self.queries = tuple(one.query for one in ranked)
         self._submitted = time()  # the next wait begins here

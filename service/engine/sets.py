@@ -11,6 +11,8 @@ import asyncio
 from collections import defaultdict
 from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -35,7 +37,7 @@ from visloc.errors import (
     VislocError,
     refuse,
 )
-from visloc.options import LocalizeOptions
+from visloc.options import LocalizeOptions, ReadAs
 from visloc.priors import Priors
 from visloc.sets.choosing import (
     TileScore,
@@ -47,7 +49,8 @@ from visloc.sets.choosing import (
 )
 from visloc.sets.frame import answer_in_set, priors_in_tile, scaled_device
 from visloc.sets.unheard import hard_to_find, left_open
-from visloc.types import Near
+from visloc.timing import summed
+from visloc.types import Near, Reason, Refusal
 
 # Codes of errors of reaching a map, not of the map itself, begin with one of these.
 _OF_A_MAP = ("map.", "maps.")
@@ -116,10 +119,12 @@ class SetSearch:
         outline = self._catalog.set_outline(map_set)
         allowed = allowed_tiles(outline, job.priors, await self.within(outline, job.maps))
 
-        async def ask(row: int, folder: MapFolder, queries: Sequence[Query]) -> Localization:
+        async def ask(
+            one: RigJob, row: int, folder: MapFolder, queries: Sequence[Query]
+        ) -> Localization:
             tile = outline.tiles[row]
             asked = replace(
-                job,
+                one,
                 images=with_queries(job.images, queries),
                 rig=rig_in(tile, job.rig),
                 priors=priors_in(outline, tile, job.priors),
@@ -129,14 +134,38 @@ class SetSearch:
         queries = [image.query for image in job.images]
         async with self.decoding(map_set, queries, job.options) as photos:
             choice = await self.choose(photos, allowed)
-            _, found = await self.search(outline, choice, photos, ask)
-            return found
+            tries_turns = job.rig is None and job.options.read_as is ReadAs.ANY
+            if choice.blind or np.count_nonzero(allowed) == 1 or not tries_turns:
+                return (await self.search(outline, choice, photos, partial(ask, job)))[1]
+            # As it was sent, the photo is searched in all tiles first. Otherwise each tile would
+            # look at turns of a photo that shows the next one.
+            upright = replace(job, options=replace(job.options, read_as=ReadAs.UPRIGHT))
+            _, found = await self.search(outline, choice, photos, partial(ask, upright))
+            refused, began = found.answer.refusal, perf_counter()
+            if refused is None:
+                return found
+            choice = await self.choose(photos, allowed, refused)
+            if choice.blind:
+                return found
+            left = replace(job, refused=refused)
+            _, turned = await self.search(outline, choice, photos, partial(ask, left))
+            if turned.answer.pose is not None or _is_ambiguous(turned):
+                return turned
+            return _with_turns(found, perf_counter() - began)
 
-    async def choose(self, photos: SetPhotos, allowed: NDArray[np.bool_]) -> Choice:
-        """Decode photos, and choose among the allowed tiles by the sum of the photos' scores."""
+    async def choose(
+        self,
+        photos: SetPhotos,
+        allowed: NDArray[np.bool_],
+        refused: Refusal | None = None,
+    ) -> Choice:
+        """Decode photos, and choose among the allowed tiles by the sum of the photos' scores.
+
+        For a photo that was ``refused`` as it was sent, other turns of it choose.
+        """
         rows = np.flatnonzero(allowed)
         scores: dict[int, float] = defaultdict(float)
-        for ranked in await photos.rank(allowed if len(rows) > 1 else None):
+        for ranked in await photos.rank(allowed if len(rows) > 1 else None, refused):
             for each in ranked:
                 scores[each.tile] += each.score
         best_first = sorted(scores, key=lambda tile: -scores[tile])
@@ -233,6 +262,17 @@ def _in_turn(
     yield choice.rest
     doubtful = {outline.tiles[row].ref for row, each in found if is_doubtful(each.answer)}
     yield hard_to_find(outline, doubtful, choice.without([row for row, _ in found]))
+
+
+def _is_ambiguous(found: Localization) -> bool:
+    refusal = found.answer.refusal
+    return refusal is not None and refusal.reason is Reason.AMBIGUOUS
+
+
+def _with_turns(found: Localization, seconds: float) -> Localization:
+    """Add the time that other turns took."""
+    stages = summed(found.answer.seconds, {"turns": seconds})
+    return replace(found, answer=replace(found.answer, seconds=stages))
 
 
 def tile_unavailable(tile: TileRecord, error: VislocError) -> VislocError:

@@ -121,7 +121,7 @@ class Metrics:
         )
         self._tiles_searched = histogram(
             "visloc_tiles_searched",
-            "Maps of a set that were searched for a photo or an instant.",
+            "Maps of a set that were searched for a photo, again in other turns, or an instant.",
             buckets=(1, 2, 3, 4, 5),
         )
         self._map_changes = counter(

@@ -6,19 +6,21 @@ from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from service.values import ONLY_SENSOR, ImageJob, Localization, Rig
+from service.values import ONLY_SENSOR, ImageJob, Localization, Rig, RigJob
 from service.workers.photos import DecodedQuery
 from visloc.archive import Map
 from visloc.archive.places import anchor_rms
 from visloc.errors import InvalidInput, refuse
 from visloc.geometry import Pose
+from visloc.images import Photo
 from visloc.localization.geometry.constraints import Constraints
 from visloc.localization.localizer import Localizer
+from visloc.localization.query.camera import resolve_camera
 from visloc.localization.solving import Look, SeenImage
 from visloc.options import LocalizeOptions
 from visloc.priors import Priors
 from visloc.timing import summed
-from visloc.types import InstantAnswer, QueryFeatures, Reason, Refusal, RigSensor
+from visloc.types import Evidence, InstantAnswer, QueryFeatures, Reason, Refusal, RigSensor
 
 _MAX_LISTED = 500  # characters of names from outside
 # Errors of the request, not of one image, have codes that begin so.
@@ -82,6 +84,15 @@ class Target:
         """Whether this tile is one of those that the priors name, if they name tiles."""
         opened = self.localizer.map
         return priors.maps is None or not {opened.manifest.id, opened.ref}.isdisjoint(priors.maps)
+
+
+def refused_before(job: RigJob, photo: Photo, seconds: Mapping[str, float]) -> SeenImage:
+    """Return a photo on its own that ``job.refused`` says enough about as it was sent."""
+    assert job.refused is not None
+    (image,), read_as = job.images, job.options.orientation
+    used, source = resolve_camera(photo, image.camera)
+    evidence = Evidence(used, source, photo.exif_orientation, read_as, seconds=seconds)
+    return SeenImage.alone(Look.nothing(evidence, job.refused))
 
 
 def rig_in_map(rig: Rig | None, opened: Map) -> Mapping[str, RigSensor]:

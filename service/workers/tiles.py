@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from time import perf_counter
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from service.workers.photos import DecodedQuery, ExtractorOf
 from visloc.archive import MapSet, open_map
 from visloc.errors import InvalidInput, MapCorrupt
+from visloc.features import LocalFeatureExtractor
 from visloc.features.framing import Framing
 from visloc.features.local.readymade import (
     MAX_READY_MADE_KEYPOINTS,
@@ -21,8 +23,9 @@ from visloc.features.resolution import WorkingResolution
 from visloc.images import Photo
 from visloc.localization.geometry.constraints import MapGeometry
 from visloc.localization.query.camera import query_resolution, resolve_camera
-from visloc.localization.query.feature_cache import find_features
+from visloc.localization.query.feature_cache import FeatureCache, find_features
 from visloc.localization.query.fingerprints import check_fingerprint
+from visloc.localization.turning import QUARTERS
 from visloc.options import LocalizeOptions
 from visloc.sets.choosing import TileScore
 from visloc.sets.coarse import rank_tiles
@@ -105,13 +108,53 @@ class TileRanker:
         with timed(decoded.seconds, "choose_tiles"):
             return rank_tiles(self._set, local, allowed)
 
-    def _feature_size(self, photo: Photo) -> tuple[int, int] | None:
+    def rank_turned(
+        self,
+        decoded: DecodedQuery,
+        options: LocalizeOptions,
+        allowed: NDArray[np.bool_] | None,
+        step: Callable[[], None] = lambda: None,
+    ) -> tuple[TileScore, ...]:
+        """Rank tiles by a photo in all quarter turns, each tile by its best one.
+
+        Args:
+            decoded: the query, which keeps the features for the tiles unless its pictures may be
+                large. Features that were sent rank no tile.
+            options: how features are found.
+            allowed: (T,) the tiles to rank; None for none.
+            step: called before each turn, it may raise to end the search.
+        """
+        photo, best = decoded.query, dict[int, float]()
+        found = decoded.found if self._resolution is not None else {}
+        if not isinstance(photo, Photo) or self._extractor is None or allowed is None:
+            return ()
+        with timed(decoded.seconds, "turns"):
+            for turned in (0, *QUARTERS):
+                step()
+                local = self._photo_features(photo, self._extractor, found, options, turned)
+                for each in rank_tiles(self._set, local, allowed) if len(local) > 0 else ():
+                    best[each.tile] = max(each.score, best.get(each.tile, each.score))
+        ranked = sorted(best, key=lambda tile: -best[tile])
+        return tuple(TileScore(tile, best[tile]) for tile in ranked)
+
+    def _feature_size(self, photo: Photo, turned: int) -> tuple[int, int] | None:
         if self._resolution is None:
             return None
         # The camera that was sent is not known here; a tile to which it matters looks again.
         camera, source = resolve_camera(photo, None)
         resolution = query_resolution(camera, source)
-        return self._resolution.feature_size(resolution, photo.width, photo.height)
+        return self._resolution.feature_size(resolution, photo.width, photo.height, turned)
+
+    def _photo_features(
+        self,
+        photo: Photo,
+        extractor: LocalFeatureExtractor,
+        found: FeatureCache,
+        options: LocalizeOptions,
+        turned: int = 0,
+    ) -> LocalFeatures:
+        framing = Framing(self._feature_size(photo, turned), turned)
+        return find_features(photo, extractor, _MOST_KEYPOINTS, options, found, framing)[0]
 
     def _features(self, decoded: DecodedQuery, options: LocalizeOptions) -> LocalFeatures | None:
         """Return local features; None for a query that no map of the set takes."""
@@ -120,14 +163,7 @@ class TileRanker:
             if self._extractor is None:
                 return None
             known, began = len(decoded.found), perf_counter()
-            local, _ = find_features(
-                query,
-                self._extractor,
-                _MOST_KEYPOINTS,
-                options,
-                decoded.found,
-                Framing(self._feature_size(query)),
-            )
+            local = self._photo_features(query, self._extractor, decoded.found, options)
             if len(decoded.found) > known:
                 decoded.seconds["local_features"] = perf_counter() - began
             return local

@@ -35,7 +35,14 @@ from service.values import (
     SequenceStep,
     WorkerSettings,
 )
-from service.workers.instants import Target, check_images, check_options, check_priors, rig_in_map
+from service.workers.instants import (
+    Target,
+    check_images,
+    check_options,
+    check_priors,
+    refused_before,
+    rig_in_map,
+)
 from service.workers.judging import gated, judged
 from service.workers.open_maps import OpenMaps
 from service.workers.photos import DecodedQuery, decode, pack
@@ -51,7 +58,7 @@ from visloc.localization.turning import is_worth_turning
 from visloc.options import LocalizeOptions
 from visloc.priors import Priors
 from visloc.timing import summed
-from visloc.types import InstantAnswer
+from visloc.types import InstantAnswer, Refusal
 
 logger = logging.getLogger(__name__)
 
@@ -123,12 +130,8 @@ class Vision:
         seconds = {"queued": max(0.0, queued), "open_map": perf_counter() - started}
         (image,) = job.images
         decoded = self._decode(image.query)
-        seconds, seen = summed(seconds, decoded.seconds), list[SeenImage]()
-        for target in targets:
-            self._step()
-            seen.append(target.look(image, decoded, job.options, job.priors, seconds))
-            if seen[-1].error is not None:
-                raise seen[-1].error
+        seconds = summed(seconds, decoded.seconds)
+        seen = [self._seen(job, target, decoded, seconds) for target in targets]
         looked, best, target, solved = self._solve_photo(job, targets, seen)
         began = perf_counter()
         turned = self._turned(job, targets, decoded, seen, best.answer)
@@ -147,6 +150,19 @@ class Vision:
         self._step()
         told = gated(best, job.options)
         return replace(best, debug=_picture(decoded.query, target, look, told, solved))
+
+    def _seen(
+        self, job: RigJob, target: Target, decoded: DecodedQuery, seconds: Mapping[str, float]
+    ) -> SeenImage:
+        """Look at a photo on its own as it was sent, unless it was refused so before."""
+        self._step()
+        (image,) = job.images
+        if job.refused is not None and isinstance(decoded.query, Photo):
+            return refused_before(job, decoded.query, seconds)
+        seen = target.look(image, decoded, job.options, job.priors, seconds)
+        if seen.error is not None:
+            raise seen.error
+        return seen
 
     def _turned(
         self,
@@ -171,18 +187,19 @@ class Vision:
         for target, one in zip(targets, seen, strict=True):
             began = perf_counter()
             turns, look = target.localizer.turns, one.look
-            assert turns is not None  # the photo was looked at
             assert look is not None
-            turned = turns.find(
-                photo,
-                look.evidence,
-                refusal.reason,
-                job.options,
-                job.priors,
-                decoded.found,
-                self._step,
-            )
-            seconds = {**look.evidence.seconds, "turns": perf_counter() - began}
+            turned = 0
+            if turns is not None:  # else other tiles took the photo, this one takes features only
+                turned = turns.find(
+                    photo,
+                    look.evidence,
+                    refusal.reason,
+                    job.options,
+                    job.priors,
+                    decoded.found,
+                    self._step,
+                )
+            seconds = summed(look.evidence.seconds, {"turns": perf_counter() - began})
             if turned:
                 self._step()
                 any_turned = True
@@ -265,11 +282,13 @@ class Vision:
         options: LocalizeOptions,
         allowed: NDArray[np.bool_] | None,
         submitted: float,
+        refused: Refusal | None = None,
     ) -> RankedTiles:
         """Decode a photo, find its features, and rank tiles of a set by them.
 
         An unusable photo comes back as it is, and ranks no tile. The tiles to rank are ``allowed``
-        (T,); None ranks none.
+        (T,); None ranks none. If the photo was ``refused`` as it was sent, they are ranked by other
+        turns of it, or not at all if no turn can help.
         """
         queued, started = max(0.0, time() - submitted), perf_counter()
         self._step()
@@ -280,7 +299,12 @@ class Vision:
         except InvalidInput:
             return RankedTiles(query)  # the tile that is searched reports the error
         decoded = replace(decoded, seconds=summed(seconds, decoded.seconds))
-        scores = ranker.rank(decoded, options, allowed)
+        if refused is None:
+            scores = ranker.rank(decoded, options, allowed)
+        elif is_worth_turning(refused.reason, options):
+            scores = ranker.rank_turned(decoded, options, allowed, self._step)
+        else:
+            scores = ()
         return RankedTiles(pack(decoded), scores)
 
     def open_sequence(self, start: SequenceJob, maps: Sequence[MapFolder]) -> PackedSequence:

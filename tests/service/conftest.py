@@ -115,6 +115,16 @@ def site(built_maps: Path, study: Path, tmp_path_factory: pytest.TempPathFactory
     return maps
 
 
+@pytest.fixture(scope="session")
+def upright_site(sample: Path, study: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """``room``, ``study`` and their set, with features that do not know a turned photo."""
+    from tests.service.map_sets import write_upright_site
+
+    maps = tmp_path_factory.mktemp("upright_site")
+    write_upright_site(sample, study, maps)
+    return maps
+
+
 @pytest.fixture
 def site_copy(site: Path, tmp_path: Path) -> Path:
     """The same, to be changed."""

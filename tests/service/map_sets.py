@@ -77,6 +77,22 @@ def write_site(study: Path, maps: Path) -> None:
     publish_set(store, "model", [("room", MODEL_FROM_ROOM)], quiet)
 
 
+def write_upright_site(sample: Path, study: Path, maps: Path) -> None:
+    """Write ``room``, ``study`` and a set with XFeat: SIFT would know a turned photo as it is."""
+    for map_id, dataset in (("room", sample), ("study", study)):
+        settings = BuildSettings(
+            dataset / "mapping",
+            map_id,
+            maps,
+            method="rgbd",
+            local_features="xfeat",
+            max_keypoints=1500,
+        )
+        build_map(settings, quiet)
+    rooms = [("room", SITE_FROM_ROOM), ("study", SITE_FROM_STUDY)]
+    publish_set(MapStore(maps), "site", rooms, quiet)
+
+
 def photos_of(study: Path) -> list[Any]:
     """Photos of a dataset's queries with their cameras and poses."""
     dataset = read_dataset(study / "query")

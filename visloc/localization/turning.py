@@ -35,8 +35,8 @@ REASONS_OF_TURNED_PHOTOS = (
 # In a symmetric room, a photo that is upside down gets a wrong pose.
 _WORTH_TURNING = (*REASONS_OF_TURNED_PHOTOS, Reason.UNCERTAIN_POSE, Reason.UNLIKELY_POSE)
 # Degrees clockwise. 135 and 225 are left out: a camera is hardly held upside down and askew.
-_QUARTERS, _ASKEW = (90, 180, 270), (45, 315)
-_ALL = (*_QUARTERS, *_ASKEW)
+QUARTERS, _ASKEW = (90, 180, 270), (45, 315)
+_ALL = (*QUARTERS, *_ASKEW)
 _STEP_DEG = 45
 _NUM_KEYPOINTS, _NUM_PHOTOS = 1000, 3
 # A turn is worth a try if it has this many clear matches with one photo, this many times as many as
@@ -94,7 +94,7 @@ class TurnFinder:
             cache: features of this photo; those of the turns are added.
             step: called before each look, it may raise to end the search.
         """
-        if not is_worth_turning(reason, options):
+        if not self._descriptors or not is_worth_turning(reason, options):
             return 0
         constraints = Constraints(self._geometry, priors)
         turns = _turns_by(constraints.gravity, photo)

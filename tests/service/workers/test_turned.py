@@ -10,8 +10,6 @@ from typing import Protocol
 
 import pytest
 
-from mapping.build.build import build_map
-from mapping.build.settings import BuildSettings
 from service.values import Abandoned, MapFolder, WorkerSettings, photo_job
 from service.workers.vision import Vision
 from tests.turning import png, turned_camera, turned_pixels, turned_pose
@@ -32,18 +30,9 @@ class Query(Protocol):
 
 
 def test_a_photo_of_a_turned_camera_is_found_and_drawn(
-    sample: Path, query: Query, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    upright_site: Path, query: Query, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    settings = BuildSettings(
-        dataset=sample / "mapping",
-        map_id="room",
-        maps_dir=tmp_path,
-        method="rgbd",
-        local_features="xfeat",
-        max_keypoints=1500,
-    )
-    build_map(settings, lambda *_: None)
-    store = MapStore(tmp_path)
+    store = MapStore(upright_site)
     maps = [MapFolder(store.open("room").ref, store.folder("room"))]
     image = png(turned_pixels(read_photo(query.image).rgb, 3))
     camera, truth = turned_camera(query.camera, 3), turned_pose(query.cam_from_world, 3)
