@@ -60,7 +60,7 @@ def _legend(picture: NDArray[np.uint8], zoom: float, extent: float, *, metric: b
     picture[_SIDE:] = _PAPER
     for x, colour, text in (
         (_MARGIN, _RIGHT, "found again"),
-        (_MARGIN + 220, _WRONG, "not found: film again"),
+        (_MARGIN + 220, _WRONG, "not found"),
     ):
         cv2.circle(picture, (x, _SIDE + 40), 8, colour, -1, 16)
         cv2.putText(picture, text, (x + 18, _SIDE + 46), _FONT, 0.6, _INK, 1, 16)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -54,20 +55,24 @@ def find_sources(paths: Sequence[Path]) -> Sources:
     folders: dict[str, Path] = {}
     exports: dict[str, Path] = {}
     taken: set[str] = set()
+    counted: set[str] = set()
     for path in paths:
         if not path.exists():
             raise refuse("capture.source", field=str(path))
-        if path.resolve() in {one.resolve() for one in (*videos.values(), *folders.values())}:
+        is_export = path.is_dir() and (path / _EXPORT).is_file()
+        # Unlike Path.resolve, this does not raise for a link that leads to itself.
+        place = os.path.realpath(path / _EXPORT if is_export else path)
+        if place in counted:
             continue
-        if path.is_dir() and (path / _EXPORT).is_file():
+        counted.add(place)
+        if is_export:
             exports[_new_name(path.resolve().name, taken)] = path
         elif path.is_dir():
             folders[_new_name(path.resolve().name, taken)] = path
-            named = {one.resolve() for one in videos.values()}
             for file in sorted(path.iterdir()):
-                if file.resolve() in named:
-                    continue
-                if file.suffix.lower() in SUFFIXES and _is_plain(file) and is_video(file):
+                is_one = file.suffix.lower() in SUFFIXES and _is_plain(file) and is_video(file)
+                if is_one and (place := os.path.realpath(file)) not in counted:
+                    counted.add(place)
                     videos[_new_name(file.stem, taken)] = file
         elif path.suffix.lower() == ".json" and path.is_file():  # a pipe would never end
             exports[_new_name(path.resolve().parent.name, taken)] = path

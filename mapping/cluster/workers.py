@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import signal
 import sys
+import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -37,6 +38,10 @@ ONE_THREAD = {
 # What the tasks of a build need beside networks.
 _PRELOADED = ("mapping.build.build",)
 
+# The server's socket lies below the folder of temporary files. Its path has at most 107 bytes, of
+# which multiprocessing appends 32.
+_LONGEST_TEMPORARY = 70
+
 # Items sent together: few, so that progress shows and all workers stay busy to the end.
 _MAX_BATCH, _MIN_BATCHES = 16, 200
 
@@ -52,7 +57,7 @@ class Workers:
 
     def __init__(self, count: int) -> None:
         self._pool = (
-            ProcessPoolExecutor(count, mp_context=_forking(), initializer=_start_worker)
+            ProcessPoolExecutor(count, mp_context=_start_method(), initializer=_start_worker)
             if count > 1
             else None
         )
@@ -100,12 +105,15 @@ class Workers:
             task(item, progress)
 
 
-def _forking() -> multiprocessing.context.BaseContext:
+def _start_method() -> multiprocessing.context.BaseContext:
     """Return a way to start processes: forks of a server that has loaded what they need.
 
     Loading takes seconds of each process otherwise, and its memory is shared. The server computes
-    nothing: a forked child of a process that has used torch hangs.
+    nothing: a forked child of a process that has used torch hangs. Where no server can listen, each
+    process loads what it needs itself.
     """
+    if len(os.fsencode(tempfile.gettempdir())) > _LONGEST_TEMPORARY:
+        return multiprocessing.get_context("spawn")
     context = multiprocessing.get_context("forkserver")
     needed = [*_PRELOADED, *(["torch"] if "torch" in sys.modules else [])]
     context.set_forkserver_preload(needed)

@@ -39,8 +39,9 @@ _TURN = "turn"
 # that lie on it are dropped: it may have most of the strongest.
 _TIMES_FOUND = 2
 # Photos whose features a process keeps: a photo is a partner of several that are matched one after
-# the other. 5000 keypoints with 128 numbers are 2.6 MB.
-_KEPT = 32
+# the other. 5000 keypoints with 128 numbers are 2.6 MB. Where photos may have many more, none are
+# kept.
+_KEPT, _MOST_KEYPOINTS_KEPT = 32, 10_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,8 +104,9 @@ class ExtractedFeatures:
 
     def _get(self, photo: MappingPhoto) -> Item:
         key = self.key(photo)
-        with suppress(Unavailable):  # it was not computed yet, or is damaged
-            return _recent(self.work, key)
+        if self.max_keypoints <= _MOST_KEYPOINTS_KEPT:
+            with suppress(Unavailable):  # it was not computed yet, or is damaged
+                return _recent(self.work, key)
         return self.work.get(key, partial(self._extract, photo))
 
     def _extract(self, photo: MappingPhoto) -> Item:

@@ -230,11 +230,13 @@ class _MatchTask:
         def compute() -> Item:
             if self.given is not None:
                 return _item(self._given(group, self.given))
-            own, *others = (
+            # One partner at a time: with exhaustive pairs, a photo has thousands.
+            sides = (
                 round_descriptors(self.features.read(photo).descriptors)
                 for photo in (group.photo, *group.partners)
             )
-            pairs = (mutual_nearest_neighbours(own, theirs)[:2] for theirs in others)
+            own = next(sides)
+            pairs = (mutual_nearest_neighbours(own, theirs)[:2] for theirs in sides)
             return _item([np.column_stack(rows).astype(np.uint32) for rows in pairs])
 
         if not self.work.has(self.matches_key(group)):

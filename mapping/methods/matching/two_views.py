@@ -119,14 +119,27 @@ class _TwoViews:
     def fits(
         self, a: NDArray[np.float64], b: NDArray[np.float64], max_error_px: float
     ) -> NDArray[np.bool_]:
-        """Tell which matched pixels (n, 2) fit it, in front of both cameras."""
+        """Tell which matched pixels (n, 2) fit it, in front of both cameras.
+
+        Pixels as near to those of infinitely far points as an inlier is to its line do not tell
+        their side: of far points, noise would put half behind. If most are such pixels, PoseLib
+        does not know in which of both directions the camera moved.
+        """
         near = _sampson_errors(self.fundamental, a, b) <= max_error_px
         if self.pose is None:
             return np.asarray(near)
         ones = np.ones((len(a), 1))
         rays_a, rays_b = (np.hstack([pixels / self.focal_px, ones]) for pixels in (a, b))
-        errors = epipolar_errors(rays_a, rays_b, Pose(self.pose.R, self.pose.t))
-        return np.asarray(near & np.isfinite(errors))
+        turned = rays_a @ self.pose.R.T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            parallax = np.linalg.norm(b - self.focal_px * turned[:, :2] / turned[:, 2:], axis=1)
+        are_far = (turned[:, 2] > 0) & (parallax <= max_error_px)
+        directions = (
+            np.isfinite(epipolar_errors(rays_a, rays_b, Pose(self.pose.R, sign * self.pose.t)))
+            for sign in (1, -1)
+        )
+        in_front = max(directions, key=lambda fits: np.count_nonzero(fits & near & ~are_far))
+        return np.asarray(near & (in_front | are_far))
 
 
 def _estimated(

@@ -38,7 +38,8 @@ ADJUSTMENT, TRIANGULATION = "adjustment", "triangulation"
 # 16 degrees they may be far apart and share few matches, and their errors spread to other photos.
 _FIRST_ANGLE_DEG = 4.0
 # All photos are adjusted together when the model has grown by this factor. With COLMAP's 1.1, twice
-# as many times: poses of the painted room and of castle were as good.
+# as many times: poses of castle and of most films of the painted room were as good
+# (docs/performance.md#builds).
 _GROWTH = 1.25
 # After so many models that put cameras in doubt, no camera with a prior is refined any more.
 _MAX_JUDGEMENTS = 3

@@ -59,6 +59,17 @@ def test_what_is_named_twice_counts_once(make_video: MakeVideo, tmp_path: Path) 
         sources = find_sources(paths)
         assert sources.videos == {"walk": film}
         assert sources.folders == {"photos": folder}
+    scan = tmp_path / "scan"
+    scan.mkdir()
+    (scan / "transforms.json").write_text("{}")
+    for paths in ([scan, scan / "transforms.json"], [scan / "." / "transforms.json", scan]):
+        assert set(find_sources(paths).exports) == {"scan"}
+
+
+def test_a_link_that_leads_to_itself_is_passed_over(tmp_path: Path) -> None:
+    folder = save_photos(tmp_path / "photos")
+    (folder / "loop").symlink_to("loop")
+    assert find_sources([folder]).folders == {"photos": folder}
 
 
 def test_photos_are_named_by_their_time(make_video: MakeVideo, tmp_path: Path) -> None:

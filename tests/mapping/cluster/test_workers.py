@@ -1,12 +1,15 @@
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from functools import partial
+from multiprocessing import forkserver
 from pathlib import Path
 
 import cv2
@@ -135,6 +138,19 @@ def test_every_item_is_done_once_and_told(tmp_path: Path, count: int) -> None:
     assert [int(square) for square, _ in results] == [0, 1, 4, 9, 16]
     here = {pid == str(os.getpid()) for _, pid in results}
     assert here == {count == 1}
+
+
+def test_the_folder_of_temporary_files_may_have_a_long_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    long = tmp_path / ("long" * 25)
+    long.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(long))
+    # As in a process that has started no worker yet.
+    monkeypatch.delitem(multiprocessing.current_process()._config, "tempdir", raising=False)  # type: ignore[attr-defined]
+    monkeypatch.setattr(forkserver._forkserver, "_forkserver_pid", None)
+    Workers(2).run(partial(write_square, tmp_path), [3, 4], ignore)
+    assert {path.name for path in tmp_path.glob("[0-9]")} == {"3", "4"}
 
 
 @pytest.mark.parametrize("count", [1, 2])

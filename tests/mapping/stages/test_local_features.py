@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -79,3 +80,13 @@ def test_a_mask_is_part_of_the_key_of_its_own_cameras_photos(
     assert source.outside({"cam": mask}).key(photo) != source.key(photo)
     assert source.outside({"cam": ~mask}).key(photo) != source.outside({"cam": mask}).key(photo)
     assert source.outside({"other": mask}).key(photo) == source.key(photo)
+
+
+def test_a_process_keeps_features_unless_there_may_be_very_many(
+    photo: MappingPhoto, source: ExtractedFeatures
+) -> None:
+    many = replace(source, max_keypoints=100_000)
+    for each, is_kept in ((source, True), (many, False)):
+        first, again, third = (each.read(photo).keypoints for _ in range(3))
+        assert np.array_equal(first, again)
+        assert np.shares_memory(again, third) == is_kept

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import weakref
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mapping.cluster.workers import Workers
+from mapping.methods.matching import stages
 from mapping.methods.matching.stages import (
     Verification,
     find_fixed,
@@ -25,6 +27,7 @@ from mapping.stages.work_folder import WorkFolder
 from visloc.geometry import Camera, Pose
 from visloc.kapture import FileRecord
 from visloc.kapture.matches import open_matches, write_matches
+from visloc.matching.products import EightBitRows, round_descriptors
 from visloc.options import Inference
 from visloc.pose.colmap import project
 from visloc.types import Fingerprint, LocalFeatures
@@ -88,6 +91,24 @@ def test_wrong_matches_do_not_fit_and_right_ones_do(tmp_path: Path, poses_known:
     # A wrong one may lie on its line by chance.
     assert 40 <= found[0, 1] <= 43
     assert 40 <= found[1, 2] <= 43
+
+
+def test_partners_are_in_memory_one_at_a_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rounded: list[weakref.ref[NDArray[np.int8]]] = []
+    alive: list[int] = []
+
+    def watched(descriptors: NDArray[np.float32]) -> EightBitRows:
+        found = round_descriptors(descriptors)
+        rounded.append(weakref.ref(found.rows))
+        alive.append(sum(rows() is not None for rows in rounded))
+        return found
+
+    monkeypatch.setattr(stages, "round_descriptors", watched)
+    matched(tmp_path, np.array([[0, 1], [0, 2]] * 5))
+    assert len(alive) == 11
+    assert max(alive) <= 3  # the photo, the partner before and the next one
 
 
 def test_a_pair_with_fewer_matches_than_are_asked_for_has_none(tmp_path: Path) -> None:

@@ -59,6 +59,21 @@ def test_of_many_matches_those_behind_the_cameras_do_not_fit() -> None:
     assert not fits[2000:].any()
 
 
+# Moved by none, 2 px or so, and 30 % of the points nearer than the others; in units of the world.
+@pytest.mark.parametrize(("moved", "away"), [(0.0, 1.0), (0.02, 1.0), (-0.02, 1.0), (0.6, 60.0)])
+def test_of_many_matches_those_too_far_to_tell_their_side_fit(moved: float, away: float) -> None:
+    random = np.random.default_rng(0)
+    points = random.uniform([-2, -1.5, 4], [2, 1.5, 8], (2000, 3))
+    points[:1400] *= away
+    second = Pose(np.eye(3), np.array([moved, 0.0, 0.0]))
+    a, b = (
+        (project(CAMERA, seen) + random.normal(0, 0.5, (2000, 2))).astype(np.float32)
+        for seen in (points, second.apply(points))
+    )
+    fits = fits_two_views((CAMERA, CAMERA), a, b, 4.0, calibrated=True)
+    assert fits.mean() > 0.97
+
+
 @pytest.mark.parametrize("calibrated", [True, False])
 def test_wrong_matches_alone_never_fit(calibrated: bool) -> None:
     a, b = two_photos(0, 1000)
