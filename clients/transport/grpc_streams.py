@@ -78,7 +78,7 @@ class _Ending:
     status first, and then replaces it with ``INTERNAL`` (https://github.com/grpc/grpc/issues/36066).
 
     Attributes:
-        error: the first status; None while the call lasts.
+        error: the first status, if it is not ``OK``; None while the call lasts.
     """
 
     def __init__(self, call: Any) -> None:
@@ -86,9 +86,9 @@ class _Ending:
         call.add_done_callback(self._keep)
 
     def _keep(self, call: Any) -> None:
-        if self.error is None:
-            told = map(_result, (call.code(), call.trailing_metadata(), call.details()))
-            code, trailing, details = told
+        code = _result(call.code())
+        if self.error is None and code is not grpc.StatusCode.OK:
+            trailing, details = _result(call.trailing_metadata()), _result(call.details())
             self.error = grpc.aio.AioRpcError(code, grpc.aio.Metadata(), trailing, details, None)
 
 
