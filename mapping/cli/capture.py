@@ -39,6 +39,7 @@ def capture(
         Path | None,
         typer.Option(
             "--output",
+            dir_okay=False,
             help="PNG of the walk from above; an existing file is replaced. Default: "
             "ID-capture.png here.",
         ),
