@@ -72,7 +72,7 @@ promtool:
 demo: install ## the main job on a synthetic sample: build, serve, localize, picture
 	$(BIN)/python examples/demo.py
 
-test: install browser balancer promtool ## the tests, in about fifteen minutes on two cores
+test: install browser balancer promtool ## the tests, in about twelve minutes on two cores
 	$(BIN)/pytest -m 'not slow' --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
 test-all: install browser balancer promtool ## the slow tests too
