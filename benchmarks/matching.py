@@ -1,4 +1,4 @@
-"""What matching a photo costs, part by part, in blocks of 256 rows and in those that fit a cache.
+"""Measure what matching a photo costs, in blocks of 256 rows and in blocks that fit a cache.
 
     python -m benchmarks.matching MAP QUERY [--weights-dir DIR] [--photos 6] [--repeats 9]
 

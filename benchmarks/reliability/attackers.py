@@ -73,7 +73,7 @@ class Assault:
 
     @property
     def attack(self) -> Attack:
-        """What the connections of this attack do."""
+        """Open this attack's connections, and keep them busy."""
         return next(each for each in ATTACKS if each.name == self.name)
 
 

@@ -48,7 +48,9 @@ def main(
         if not kept.exists() or commit.endswith("+"):
             typer.echo(f"{name} ...", err=True)
             measured = _measured(name, commit, data.resolve(), folder)
-            kept.write_text(json.dumps(asdict(measured), indent=1), encoding="utf-8")
+            half = kept.with_suffix(".partial")  # a kill in between must not stop later runs
+            half.write_text(json.dumps(asdict(measured), indent=1), encoding="utf-8")
+            half.replace(kept)
         measured = Measured(**json.loads(kept.read_text(encoding="utf-8")))
         if measure_only:
             typer.echo("\n".join((f"{name}, {measured.date}, {commit}", *measured.rows)))

@@ -1,4 +1,4 @@
-"""What each table of docs/results.md is made by.
+"""The commands that make each table of docs/results.md.
 
 A table is the rows that its scripts print, under one header. ``DATA``, ``MAPS`` and ``WORK`` in a
 command stand for the folders of the run.

@@ -1,4 +1,4 @@
-"""What a service's processes and threads cost: a table of workers x threads (docs/operations.md).
+"""Measure what a service's workers and threads cost (docs/performance.md).
 
     python -m benchmarks.speed.workers MAPS_DIR MAP QUERY_DATASET [--shapes 1x1,1x2,2x1,2x2]
 
