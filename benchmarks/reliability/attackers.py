@@ -73,7 +73,7 @@ class Assault:
 
     @property
     def attack(self) -> Attack:
-        """Open this attack's connections, and keep them busy."""
+        """The attack of this name."""
         return next(each for each in ATTACKS if each.name == self.name)
 
 

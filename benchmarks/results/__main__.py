@@ -23,6 +23,7 @@ import typer
 
 from benchmarks.results.page import Measured, joined_rows, with_table
 from benchmarks.results.tables import MAPS, TABLES, Build
+from visloc.kapture.writer import write_atomically
 
 ROOT = Path(__file__).parents[2]
 
@@ -48,15 +49,13 @@ def main(
         if not kept.exists() or commit.endswith("+"):
             typer.echo(f"{name} ...", err=True)
             measured = _measured(name, commit, data.resolve(), folder)
-            half = kept.with_suffix(".partial")  # a kill in between must not stop later runs
-            half.write_text(json.dumps(asdict(measured), indent=1), encoding="utf-8")
-            half.replace(kept)
+            write_atomically(kept, json.dumps(asdict(measured), indent=1).encode())
         measured = Measured(**json.loads(kept.read_text(encoding="utf-8")))
         if measure_only:
             typer.echo("\n".join((f"{name}, {measured.date}, {commit}", *measured.rows)))
         else:
             text = page.read_text(encoding="utf-8")
-            page.write_text(with_table(text, name, measured), encoding="utf-8")
+            write_atomically(page, with_table(text, name, measured).encode())
 
 
 def commit_of(root: Path) -> str:

@@ -86,9 +86,9 @@ class OneByOne:
         started = monotonic()
         try:
             each.parsed.set_result(each.parse())
-        # Whoever waits gets it. Also a panic of a library in Rust, which is no Exception: it would
-        # end the only thread.
-        except BaseException as error:  # noqa: BLE001
+        # The caller that waits gets the error. A panic of a library in Rust is no Exception, and
+        # would end the only thread.
+        except BaseException as error:  # noqa: BLE001 - see above
             clear_frames(error.__traceback__)  # which hold the message
             each.parsed.set_exception(error)
         finally:
