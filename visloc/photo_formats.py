@@ -199,6 +199,8 @@ def _heic_header(data: bytes) -> PhotoHeader:
     outline = heic_outline(data)
     opened = pi_heif.open_heif(data)
     main = opened[opened.primary_index]
+    if 0 in main.size:
+        raise ValueError(f"it declares {main.size[0]} x {main.size[1]} pixels")
     width, height = main.size[::-1] if outline.orientation >= 5 else main.size
 
     def decode(_reduced: int) -> NDArray[np.uint8] | None:

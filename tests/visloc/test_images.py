@@ -563,7 +563,7 @@ def test_avif_of_every_kind_of_pixels_reads_as_pillow_shows_it(mode: str) -> Non
     assert photo.rgb.flags.writeable
 
 
-@pytest.mark.parametrize("declared", [(48, 34), (8, 8), (4000, 4000)])
+@pytest.mark.parametrize("declared", [(48, 34), (8, 8), (4000, 4000), (0, 0), (48, 0)])
 def test_a_heic_photo_of_another_size_than_it_declares_is_refused(
     declared: tuple[int, int],
 ) -> None:
