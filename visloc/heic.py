@@ -23,7 +23,6 @@ pi_heif.options.AUX_IMAGES = False
 pi_heif.options.DECODE_THREADS = 1
 
 _MAX_BOXES = _MAX_PICTURES = 10_000
-_MAX_PICTURES = 10_000
 # EXIF's orientation by the quarter turns clockwise that it asks for, and by whether the picture is
 # mirrored left and right afterwards.
 _ORIENTATIONS = {
@@ -62,6 +61,7 @@ def heic_outline(data: bytes) -> HeicOutline:
     Raises:
         ValueError: when they are malformed or cut off.
     """
+    _check_item_types(data)
     meta = _only(data, 0, len(data), b"meta")
     parts = {kind: (start, end) for kind, start, end in _boxes(data, meta[0] + 4, meta[1])}
     if not parts.keys() >= {b"pitm", b"iprp"}:
@@ -137,6 +137,28 @@ def _boxes(data: bytes, start: int, end: int) -> Iterator[tuple[bytes, int, int]
         yield kind, start + head, start + size
         start += size
     raise ValueError(f"the file has more than {_MAX_BOXES} boxes")
+
+
+def _check_item_types(data: bytes) -> None:
+    """Refuse a file that names a kind of item in other than printable ASCII.
+
+    pi-heif up to 1.4.0 crashes on a metadata item whose type is not valid UTF-8 (mended by
+    pillow_heif's pull request 478). ISO/IEC 14496-12 asks for four printable characters.
+    """
+    for meta, meta_start, meta_end in _boxes(data, 0, len(data)):
+        if meta != b"meta":
+            continue
+        for items, start, end in _boxes(data, meta_start + 4, meta_end):
+            if items != b"iinf":
+                continue
+            for entry, first, last in _boxes(data, start + (8 if data[start] else 6), end):
+                # Versions 0 and 1 have no type; version 3 has wider numbers.
+                if entry != b"infe" or data[first] < 2:
+                    continue
+                place = first + (8 if data[first] == 2 else 10)
+                kind = data[place : min(place + 4, last)]
+                if len(kind) < 4 or not all(0x20 <= letter < 0x7F for letter in kind):
+                    raise ValueError(f"the type {kind!r} of an item is not four printable letters")
 
 
 def _links(data: bytes, box: tuple[int, int]) -> dict[int, list[int]]:

@@ -570,6 +570,17 @@ def test_a_heic_photo_of_another_size_than_it_declares_is_refused(
     assert refusal(heic(texture(), size=declared)).code == "image.undecodable"
 
 
+def test_a_heic_item_whose_type_is_not_text_is_refused() -> None:
+    """pi-heif 1.4.0 ends the process on it. Found by the fuzzer."""
+    data = heic(texture(), exif=Image.Exif().tobytes())
+    start = data.index(b"Exif")
+
+    for kind in (b"Ex\xef" + b"f", b"\xff" * 4, b"Exi\0"):
+        error = refusal(data[:start] + kind + data[start + 4 :])
+        assert error.code == "image.undecodable"
+        assert "printable" in str(error)
+
+
 def test_a_heic_photo_that_declares_too_many_pixels_is_refused_from_its_header() -> None:
     error = refusal(heic(texture(), size=(20_000, 20_000)))
 
