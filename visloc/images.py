@@ -275,7 +275,7 @@ def _read(data: bytes, limits: ImageLimits, field: str) -> Photo:
     if passes.parts > MAX_PARTS:
         raise _too_complex(field, f"at most {MAX_PARTS} segments or chunks", "more")
     try:
-        header = open_header(data, field)
+        header = open_header(data, field, limits.max_pixels)
     except Image.DecompressionBombError as error:
         raise _too_many_pixels(field, limits.max_pixels, str(error)) from None
     width, height = header.size

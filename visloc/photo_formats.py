@@ -7,6 +7,7 @@ not: AVIF, and TIFF with transparency.
 from __future__ import annotations
 
 import io
+import math
 import os
 import re
 import struct
@@ -115,12 +116,15 @@ class PhotoHeader:
     decoded_pixels: int = 0
 
 
-def open_header(data: bytes, field: str) -> PhotoHeader:
+def open_header(data: bytes, field: str, max_webp_pixels: float = math.inf) -> PhotoHeader:
     """Read the header of a photo.
+
+    Args:
+        max_webp_pixels: Pillow's reader of WebP sets 8 bytes per pixel aside with the header.
 
     Raises:
         InvalidInput: ``image.format`` or ``image.undecodable``.
-        Image.DecompressionBombError: Pillow's own limit, which it checks for WebP only.
+        Image.DecompressionBombError: a WebP photo has more pixels, or more than Pillow's own limit.
     """
     kind = file_kind(data[:HEAD_BYTES])
     if kind is None or not kind.is_read:
@@ -134,9 +138,13 @@ def open_header(data: bytes, field: str) -> PhotoHeader:
     try:
         if kind.name == "HEIC":
             return _heic_header(data)
+        if kind.name == "WebP" and (pixels := _webp_pixels(data)) > max_webp_pixels:
+            raise Image.DecompressionBombError(f"{pixels} pixels")
         # The classes instead of Image.open: that one has a pixel limit of its own, a process-wide
         # variable, and warns or raises before ours can be compared.
         opened = _READERS[kind.name](io.BytesIO(data))
+        if isinstance(opened, TiffImageFile):
+            _check_tiff(opened, field)
     except MALFORMED as error:
         raise refuse(
             "image.undecodable",
@@ -145,8 +153,6 @@ def open_header(data: bytes, field: str) -> PhotoHeader:
             expected=FORMATS,
             got=str(error) or type(error).__name__,
         ) from error
-    if isinstance(opened, TiffImageFile):
-        _check_tiff(opened, field)
     return _pillow_header(kind.name, opened, data)
 
 
@@ -226,6 +232,18 @@ def _heic_header(data: bytes) -> PhotoHeader:
     )
 
 
+def _webp_pixels(data: bytes) -> int:
+    """Return width times height of a WebP file's canvas (RFC 9649, sections 2.5 to 2.7)."""
+    if data[12:16] == b"VP8X":
+        width, height = (int.from_bytes(data[at : at + 3], "little") + 1 for at in (24, 27))
+    elif data[12:16] == b"VP8L":
+        both = int.from_bytes(data[21:25], "little")
+        width, height = (both & 0x3FFF) + 1, (both >> 14 & 0x3FFF) + 1
+    else:
+        width, height = (side & 0x3FFF for side in struct.unpack_from("<2H", data, 26))
+    return width * height
+
+
 def _check_tiff(header: TiffImageFile, field: str) -> None:
     """Refuse those of TIFF's many kinds that would come out wrong without a word."""
     bits = header.tag_v2.get(BITSPERSAMPLE, (1,))
@@ -247,10 +265,17 @@ def _check_tiff(header: TiffImageFile, field: str) -> None:
 
 def _piece_of_tiff(header: TiffImageFile) -> int:
     """Return how many pixels a strip or tile has."""
-    rows = header.tag_v2.get(ROWSPERSTRIP, _ONE_STRIP)
+    rows = _tiff_number(header, ROWSPERSTRIP, _ONE_STRIP)
     strip = 0 if rows == _ONE_STRIP else rows * max(header.size)
-    tile = header.tag_v2.get(TILEWIDTH, 0) * header.tag_v2.get(TILELENGTH, 0)
-    return int(max(strip, tile))
+    return max(strip, _tiff_number(header, TILEWIDTH, 0) * _tiff_number(header, TILELENGTH, 0))
+
+
+def _tiff_number(header: TiffImageFile, tag: int, default: int) -> int:
+    # Bytes or text in its place would be repeated, not multiplied.
+    value = header.tag_v2.get(tag, default)
+    if not isinstance(value, int):
+        raise TypeError(f"tag {tag} is {type(value).__name__}, not a whole number")
+    return value
 
 
 def _only_pixels(png: bytes) -> bytes:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageOps, TiffImagePlugin
 
 from tests.heic import heic, tiled_heic
+from visloc import photo_formats
 from visloc.errors import InvalidInput, NotFound, TooLarge
 from visloc.images import (
     ImageLimits,
@@ -568,6 +569,37 @@ def test_a_heic_photo_of_another_size_than_it_declares_is_refused(
     declared: tuple[int, int],
 ) -> None:
     assert refusal(heic(texture(), size=declared)).code == "image.undecodable"
+
+
+@pytest.mark.parametrize("options", [{}, {"lossless": True}, {"exif": b"Exif\0\0"}])
+def test_a_webp_photo_is_measured_before_memory_is_set_aside(
+    options: dict[str, object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whichever chunk says its size: lossy, lossless and extended."""
+    data = encode(Image.fromarray(texture()), "WEBP", **options)
+    pixels = texture().shape[0] * texture().shape[1]
+    assert read_photo(data, ImageLimits(max_pixels=pixels)).rgb.shape == texture().shape
+
+    monkeypatch.delattr(photo_formats, "_READERS")
+    error = refusal(data, ImageLimits(max_pixels=pixels - 1))
+    assert error.code == "image.too_many_pixels"
+    assert f"{pixels} pixels" in str(error)
+
+
+def test_a_tiff_photo_whose_rows_per_strip_are_bytes_is_refused() -> None:
+    """Found by the fuzzer."""
+    data = encode(Image.fromarray(texture()), "TIFF")
+    at = next(
+        data.index(entry)
+        for entry in (struct.pack("<2H", 278, 3), struct.pack("<2H", 278, 4))
+        if entry in data
+    )
+    undefined = struct.pack("<2HI", 278, 7, 4)
+
+    error = refusal(data[:at] + undefined + data[at + len(undefined) :])
+
+    assert error.code == "image.undecodable"
+    assert "tag 278 is bytes" in str(error)
 
 
 def test_a_heic_item_whose_type_is_not_text_is_refused() -> None:
