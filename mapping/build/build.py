@@ -29,6 +29,7 @@ from mapping.cluster.storage import (
     opened_dataset,
     scratch_folder,
     storage_errors,
+    storage_failed,
     work_place,
 )
 from mapping.cluster.workers import one_thread_here
@@ -127,11 +128,7 @@ def build_map(
             work.remove()
             shutil.rmtree(scratch, ignore_errors=True)
     except storage_errors() as error:
-        raise refuse(
-            "storage.failed",
-            field=str(getattr(error, "filename", None) or work.root),
-            why=getattr(error, "strerror", None) or error,
-        ) from error
+        raise storage_failed(error, work.root) from error
     return folder
 
 

@@ -72,9 +72,11 @@ def _fates_of_seconds(source: str, video: FilmedVideo, fate_of: Mapping[str, str
     for second in range(int(motion.seconds[-1]) + 1):
         rows = np.flatnonzero((motion.seconds >= second) & (motion.seconds < second + 1))
         names = [photos[row] for row in rows.tolist() if row in photos]
-        known = [fate for name in names if (fate := fate_of.get(f"{source}/{name}"))]
-        if known:
-            found.append(USED if USED in known else known[0])
+        known = [fate_of.get(f"{source}/{name}", NOT_CONNECTED) for name in names]
+        # Of the photos of a second, most tell: one that joined says nothing of the others.
+        fate = max(known, key=lambda each: (known.count(each), each == USED), default=None)
+        if fate is not None and fate != NOT_CONNECTED:
+            found.append(fate)
         elif len(rows) and video.chosen.blurred[rows].all():
             found.append(BLURRED)
         elif names:

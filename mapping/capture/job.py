@@ -21,6 +21,7 @@ from mapping.capture.settings import CaptureSettings, KnownLength
 from mapping.capture.sources import Sources, find_sources, read_capture, study_videos
 from mapping.capture.trying import doubts_of_capture
 from mapping.cluster.stage_timings import Costs
+from mapping.cluster.storage import storage_failed
 from mapping.importers import ImportedModel, write_imported
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.pairing import PairSettings
@@ -153,13 +154,11 @@ def capture_map(
 
 @contextmanager
 def _told_of_the_disk(root: Path) -> Iterator[None]:
-    """Refuse with the file, and that the same command goes on, when the disk is full or broken."""
+    """Refuse with the file when one cannot be read or written."""
     try:
         yield
     except OSError as error:
-        raise refuse(
-            "storage.failed", field=str(error.filename or root), why=error.strerror or error
-        ) from error
+        raise storage_failed(error, root) from error
 
 
 @contextmanager

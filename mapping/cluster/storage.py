@@ -5,6 +5,7 @@ A URL is a ``UPath``, which has the part of ``Path``'s interface that is used he
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import sys
 import tempfile
@@ -21,6 +22,11 @@ from visloc.kapture import Dataset, read_dataset
 # kapture's text files are fetched; everything else is read where it lies.
 _TABLES = ("sensors/*.txt", "reconstruction/*.txt")
 _DATA = "sensors/records_data"
+# A disk that was full or away: with room, or when it is back, the job goes on.
+_PASSING = frozenset(
+    (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.ESTALE, errno.ETIMEDOUT)
+)
+_RESUMES = "; finished work is kept, and the same command resumes"
 
 
 def place_of(text: str, option: str) -> Path:
@@ -65,6 +71,23 @@ def storage_errors() -> tuple[type[Exception], ...]:
     """Return the errors that failing storage raises, with the libraries in use."""
     botocore = sys.modules.get("botocore.exceptions")
     return (OSError,) if botocore is None else (OSError, botocore.BotoCoreError)
+
+
+def storage_failed(error: Exception, place: Path) -> VislocError:
+    """Return the refusal of a job whose storage failed.
+
+    It says that the same command resumes only where nothing but the storage must change for that.
+
+    Args:
+        error: one of ``storage_errors``.
+        place: of the job's work, named where the error names no file.
+    """
+    passes = not isinstance(error, OSError) or error.errno in _PASSING
+    return refuse(
+        "storage.failed",
+        field=str(getattr(error, "filename", None) or place),
+        why=f"{getattr(error, 'strerror', None) or error}" + (_RESUMES if passes else ""),
+    )
 
 
 def open_store(maps_dir: Path, cache_dir: Path) -> MapStore:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import multiprocessing
+import multiprocessing.util
 import os
+import shutil
 import signal
 import sys
 import tempfile
@@ -57,7 +59,12 @@ class Workers:
 
     def __init__(self, count: int) -> None:
         self._pool = (
-            ProcessPoolExecutor(count, mp_context=_start_method(), initializer=_start_worker)
+            ProcessPoolExecutor(
+                count,
+                mp_context=_start_method(),
+                initializer=_start_worker,
+                initargs=(multiprocessing.util.get_temp_dir(),),
+            )
             if count > 1
             else None
         )
@@ -134,16 +141,22 @@ def do_batch(task: Callable[[T], object], items: Sequence[T]) -> tuple[int, Spen
     return len(items), spent_here() - before
 
 
-def _start_worker() -> None:
+def _start_worker(sockets: str) -> None:
+    """Begin a worker of a build whose sockets lie in a folder of temporary files."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    threading.Thread(target=_end_with_parent, args=(sockets,), daemon=True).start()
 
 
-def _end_with_parent() -> None:
-    """End a worker whose build was killed; it would wait for work forever."""
+def _end_with_parent(sockets: str) -> None:
+    """End a worker whose build was killed; it would wait for work forever.
+
+    A build that is killed cannot remove its folder of sockets. It does not lie in the work folder:
+    paths of sockets are short, and shared disks hold none.
+    """
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()
+    shutil.rmtree(sockets, ignore_errors=True)  # another worker may be faster
     os._exit(1)
 
 

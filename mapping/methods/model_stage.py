@@ -20,6 +20,7 @@ from mapping.methods.sparse.triangulation import (
     ADJUSTMENT,
     LOOK_ALIKES,
     MAPPING,
+    READING,
     TRIANGULATION,
     triangulate,
 )
@@ -33,7 +34,7 @@ from mapping.stages.work_folder import Item, WorkFolder, key_of
 from visloc.geometry import Camera, Pose
 
 # Raised when the code of the stage changes what comes out.
-_REVISION = 15
+_REVISION = 16
 _LATE_REVISION = 2
 _LATE = "late photos"
 _LARGEST = 127  # of descriptors in 8 bits
@@ -178,9 +179,9 @@ def _make(inputs: _Inputs, rigs: Rigs, key: str, progress: Progress) -> None:
     settings, posed = inputs.settings, not inputs.settings.estimate_poses
     adjusted = (ADJUSTMENT,) if settings.refine else ()
     stages = (
-        (TRIANGULATION, *adjusted)
+        (TRIANGULATION, *adjusted, READING)
         if posed
-        else (LOOK_ALIKES, MAPPING, ADJUSTMENT, TRIANGULATION, PLACES)
+        else (LOOK_ALIKES, MAPPING, ADJUSTMENT, TRIANGULATION, READING, PLACES)
     )
 
     def compute() -> Item:

@@ -15,7 +15,7 @@ from mapping.methods.sparse.colmap_scene import Rigs
 from mapping.methods.sparse.contradictions import ModelPhoto, Places, find_places
 from mapping.methods.sparse.model import MapperConfig, SfmPhoto, SparseModel
 from mapping.methods.sparse.triangulation import reconstruct
-from mapping.progress import ItemProgress, Progress
+from mapping.progress import ItemProgress, Progress, part_of
 from mapping.stages.landmarks import rows_by_value
 from visloc.errors import InvalidInput
 
@@ -85,7 +85,9 @@ def _places_of(
     none = np.empty(0, np.int64)
     number: dict[int, int] = {}
     placed: list[ModelPhoto] = []
+    describing = part_of(progress, 0, 2)
     for row, (photo, view) in enumerate(zip(photos, model.views, strict=True)):
+        describing(row, len(photos))
         if view is None:
             continue
         number[row] = len(placed)
@@ -99,4 +101,6 @@ def _places_of(
                 observations.rows[seen],
             )
         )
-    return number, find_places(placed, model.points, progress)
+    places = find_places(placed, model.points, part_of(progress, 1, 2))
+    progress(len(photos), len(photos))
+    return number, places

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.build.pieces import without_pieces
-from mapping.cluster.storage import map_folder, work_place
+from mapping.cluster.storage import map_folder, storage_failed, work_place
 from mapping.cluster.workers import Workers
 from mapping.maps.editing import content_of, joined
 from mapping.maps.updating.capture import (
@@ -59,7 +59,6 @@ from mapping.stages.publishing import photo_files, successor_of
 from mapping.stages.work_folder import WorkFolder
 from visloc.archive import Map, MapContent, MapStore, open_map
 from visloc.archive.schema import photo_file
-from visloc.errors import refuse
 from visloc.evaluation import pose_error
 from visloc.geometry import Similarity
 from visloc.kapture import Dataset, read_dataset
@@ -159,9 +158,7 @@ def update_map(settings: UpdateSettings, progress: Progress) -> Updated:
             )
             shutil.rmtree(work.root, ignore_errors=True)
     except OSError as error:
-        raise refuse(
-            "storage.failed", field=str(error.filename or work.root), why=error.strerror or error
-        ) from error
+        raise storage_failed(error, work.root) from error
     return Updated(folder, record, notes)
 
 

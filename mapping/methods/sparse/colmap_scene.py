@@ -15,6 +15,7 @@ from mapping.methods.matching.stages import Matches
 from mapping.methods.sparse.colmap_calls import quiet
 from mapping.methods.sparse.intrinsics import Doubt
 from mapping.methods.sparse.model import SfmPhoto, SparseModel
+from mapping.progress import ItemProgress, not_told
 from mapping.stages.landmarks import Observations, View, rows_by_value
 from visloc.errors import refuse
 from visloc.geometry import Camera, Pose
@@ -22,6 +23,8 @@ from visloc.pose.colmap import colmap_camera, pose_from_colmap
 
 Rigs = Mapping[str, Mapping[str, Pose]]
 """cam_from_rig by rig and sensor."""
+# Points between two reports of progress: about a tenth of a second of work.
+_TOLD_EVERY = 10_000
 
 
 @contextmanager
@@ -175,10 +178,12 @@ class ColmapScene:
         photos: Sequence[SfmPhoto],
         changed: Sequence[str],
         doubts: Mapping[str, Doubt],
+        progress: ItemProgress = not_told,
     ) -> SparseModel:
         """Return a reconstruction as a model.
 
         What ``changed`` does not name, ``poses`` or ``intrinsics``, is taken from the photos.
+        ``progress`` is in points.
         """
         rows_of_images = {image.image_id: row for row, image in enumerate(self.images)}
         views: list[View | None] = [None] * len(photos)
@@ -191,7 +196,11 @@ class ColmapScene:
                 pose = pose_from_colmap(model.image(image_id).cam_from_world())
             views[row] = View(camera, pose)
         points, tracks = [], []
+        count = model.num_points3D()
+        progress(0, count)
         for number, (_, point) in enumerate(sorted(model.points3D.items())):
+            if number % _TOLD_EVERY == 0:
+                progress(number, count)
             points.append(point.xyz)
             tracks += [
                 (number, rows_of_images[element.image_id], element.point2D_idx)
@@ -204,6 +213,7 @@ class ColmapScene:
         observations = Observations(table[:, 0], table[:, 1], table[:, 2], pixels)
         xyz = np.array(points, dtype=np.float64).reshape(-1, 3)
         angles = np.zeros(len(xyz), np.float32)
+        progress(count, count)
         return SparseModel(tuple(views), xyz, observations, angles, self.on_rigs, doubts)
 
 

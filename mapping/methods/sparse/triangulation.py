@@ -33,7 +33,7 @@ from visloc.errors import VislocError, refuse
 
 # Stages of a build.
 LOOK_ALIKES, MAPPING = "look-alike pairs", "incremental mapping"
-ADJUSTMENT, TRIANGULATION = "adjustment", "triangulation"
+ADJUSTMENT, TRIANGULATION, READING = "adjustment", "triangulation", "points of the model"
 # Least median angle between the rays of the two photos that the mapper begins with. With COLMAP's
 # 16 degrees they may be far apart and share few matches, and their errors spread to other photos.
 _FIRST_ANGLE_DEG = 4.0
@@ -41,6 +41,9 @@ _FIRST_ANGLE_DEG = 4.0
 # as many times: poses of castle and of most films of the painted room were as good
 # (docs/performance.md#builds).
 _GROWTH = 1.25
+# Models of few photos are adjusted as often as COLMAP does: nothing beside them holds a photo that
+# went astray between two adjustments, and they cost seconds (docs/performance.md#builds).
+_FEW_PHOTOS, _GROWTH_OF_FEW = 50, 1.1
 # After so many models that put cameras in doubt, no camera with a prior is refined any more.
 _MAX_JUDGEMENTS = 3
 
@@ -64,8 +67,8 @@ def triangulate(
         refine: names of ``REFINABLE``: what bundle adjustment may change afterwards. Refined poses
             are aligned to the given ones again. Intrinsics in doubt (``SparseModel.doubts``) stay.
         work: folder for temporary files.
-        progress: of the stages ``TRIANGULATION``, as ``triangulate_points``, and where something is
-            refined ``ADJUSTMENT``, in steps of bundle adjustments.
+        progress: of the stages ``TRIANGULATION``, as ``triangulate_points``, ``READING``, in
+            points, and where something is refined ``ADJUSTMENT``, in steps of bundle adjustments.
 
     Raises:
         InvalidInput: ``sfm.no_matches``, ``sfm.no_points``.
@@ -85,7 +88,8 @@ def triangulate(
         result, doubts = solve_with_priors(
             solve, scene, photos, refined, adjusting, poses="poses" in refine
         )
-    return without_bad_points(scene.read(result, photos, refine, doubts), config)
+    found = scene.read(result, photos, refine, doubts, partial(progress, READING))
+    return without_bad_points(found, config)
 
 
 def reconstruct(
@@ -104,7 +108,7 @@ def reconstruct(
     (``mapping.methods.sparse.look_alikes``). Of several models that do not connect, the largest is
     taken.
     The stages of ``progress`` are ``LOOK_ALIKES``, in pairs, ``MAPPING`` as ``largest_model``,
-    ``ADJUSTMENT`` in steps of bundle adjustments, and ``TRIANGULATION`` as ``triangulate_points``.
+    ``ADJUSTMENT`` in steps of bundle adjustments, and those of ``triangulate``.
 
     Raises:
         InvalidInput: ``sfm.no_matches``, ``sfm.no_model``, ``sfm.camera``, ``sfm.no_points``.
@@ -122,6 +126,8 @@ def reconstruct(
             }
             left_out = doubts.keys() - known
             options.image_names = [p.name for p in photos if p.sensor not in left_out]
+            growth = _GROWTH_OF_FEW if len(options.image_names) < _FEW_PHOTOS else _GROWTH
+            options.ba_global_frames_ratio = options.ba_global_points_ratio = growth
             return options
 
         def solve(doubts: Mapping[str, Doubt]) -> pycolmap.Reconstruction:
@@ -283,7 +289,6 @@ def pipeline_options(config: MapperConfig) -> pycolmap.IncrementalPipelineOption
     options.ba_refine_principal_point = False
     options.ba_refine_sensor_from_rig = False
     options.min_model_size = 2
-    options.ba_global_frames_ratio = options.ba_global_points_ratio = _GROWTH
     mapper, triangulation = options.mapper, options.triangulation
     mapper.random_seed = triangulation.random_seed = 0
     mapper.init_min_num_inliers = config.init_min_num_inliers

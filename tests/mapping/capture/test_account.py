@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -60,6 +61,19 @@ def test_every_second_has_a_fate() -> None:
         ("walk", "second 8 to 10", "not connected"),
         ("photos", "1 photo: a.jpg", "used"),
     ]
+
+
+def test_one_photo_that_joined_does_not_speak_for_a_second() -> None:
+    """Four photos in the first second: one of them in the map, or half."""
+    one = captured()
+    video = one.videos["walk"]
+    seconds = np.array([0.0, 0.25, 0.5, 0.75, 1.0])
+    motion = Motion(seconds, np.ones(5), seconds)
+    chosen = ChosenFrames(np.arange(4), np.zeros(5, np.bool_))
+    one = replace(one, videos={"walk": replace(video, motion=motion, chosen=chosen)}, photos=())
+    for joined, fate in (1, "not connected"), (2, "used"):
+        opened: Any = _Opened([f"walk/{name}" for name in one.videos["walk"].names[:joined]])
+        assert fates(one, opened)[0].fate == fate, joined
 
 
 def test_what_another_piece_has_is_not_to_be_filmed_again() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import shutil
 from pathlib import Path
 
@@ -12,7 +14,7 @@ import pytest
 from mapping.build.build import build_map
 from mapping.build.settings import BuildSettings
 from mapping.cli.acceptance import use
-from mapping.cluster.storage import is_remote, open_store, opened_dataset, place_of
+from mapping.cluster.storage import is_remote, open_store, opened_dataset, place_of, storage_failed
 from mapping.stages.work_folder import WorkFolder, key_of
 from visloc.archive import Map, open_map
 from visloc.errors import DatasetError, InvalidInput, Unavailable
@@ -263,3 +265,16 @@ def test_what_a_dataset_brings_along_is_not_read_from_a_url(
     with pytest.raises(InvalidInput) as caught:
         build_map(settings_for(bucket, tmp_path, **changes), quiet)
     assert caught.value.code == "build.dataset"
+
+
+@pytest.mark.parametrize(
+    ("number", "resumes"),
+    [(errno.ENOSPC, True), (errno.EIO, True), (errno.EACCES, False), (errno.ENOENT, False)],
+)
+def test_only_a_disk_that_was_full_or_away_lets_the_same_command_resume(
+    tmp_path: Path, number: int, resumes: bool
+) -> None:
+    refused = storage_failed(OSError(number, os.strerror(number), "walk.mp4"), tmp_path)
+    assert refused.field == "walk.mp4"
+    assert os.strerror(number) in str(refused)
+    assert ("the same command resumes" in str(refused)) == resumes

@@ -44,7 +44,7 @@ def ignore(_done: int, _total: int) -> None:
 # Runs the command with trouble ahead: "progress:STAGE:DONE" kills it there, "call:MODULE:FUNCTION"
 # when it gets there, "worker:STAGE" one of its workers as the stage begins, with the given signal.
 RUN = """
-import importlib, multiprocessing, os, signal, sys
+import importlib, multiprocessing.util, os, signal, sys
 from mapping.cli import main as cli
 from mapping.cli import progress
 
@@ -59,6 +59,8 @@ if __name__ == "__main__":
         show(self, stage, done, total)
         workers = multiprocessing.active_children()
         if workers:
+            with open("sockets", "w") as file:
+                file.write(multiprocessing.util.get_temp_dir())
             with open("workers", "a") as file:
                 file.write("".join(f"{worker.pid}\\n" for worker in workers))
         if kind == "progress" and [stage, str(done)] == where:
@@ -125,6 +127,7 @@ def wait_for_the_end_of_workers(folder: Path) -> None:
         assert time.monotonic() < deadline, "a worker outlived its build"
         time.sleep(0.05)
     (folder / "workers").unlink()
+    assert not Path((folder / "sockets").read_text()).exists()
 
 
 @pytest.mark.parametrize("count", [1, 2])
