@@ -121,8 +121,8 @@ def described_tiles(blocks: Path, city: City, model: CoarseModel) -> Iterator[Ma
         if not path.exists():
             made = [described(city.tile(tile).rows, model) for tile in tiles]
             unfinished = path.with_suffix(".unfinished.npz")
-            arrays = {name: np.array([getattr(tile, name) for tile in made]) for name in PARTS}
-            np.savez(unfinished, **arrays)
+            parts = {name: np.array([getattr(tile, name) for tile in made]) for name in PARTS}
+            np.savez(unfinished, allow_pickle=False, **parts)
             unfinished.rename(path)
         with np.load(path) as arrays:
             yield from map(MadeLists, *(arrays[name] for name in PARTS))

@@ -49,4 +49,4 @@ def excluded_photos(
     }
     scores, num = fusion.scores(similarities), len(retrieved.images)
     best = np.sort(scores[:num])[::-1][:_NUM_PHOTOS]
-    return everywhere.images[others[scores[num:] > best.min(initial=np.inf)]]
+    return np.asarray(everywhere.images[others[scores[num:] > best.min(initial=np.inf)]])
