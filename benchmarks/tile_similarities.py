@@ -42,9 +42,9 @@ from visloc.features.descriptors.whitening import unit_rows
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
 from visloc.options import Extraction
+from visloc.retrieval.inverted import MadeLists
 from visloc.sets.coarse import (
     CoarseModel,
-    DescribedTile,
     described,
     descriptor_of,
     descriptors_of,
@@ -166,7 +166,7 @@ def table(rows: Sequence[tuple[str, Sequence[float]]]) -> str:
     return "\n".join(lines)
 
 
-def centroids_of(tile: DescribedTile, model: CoarseModel) -> Rows:
+def centroids_of(tile: MadeLists, model: CoarseModel) -> Rows:
     """Return the unit centres of a tile's lists as descriptors."""
     return unit_rows(tile.centers) @ model["rotation"].T
 

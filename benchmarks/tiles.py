@@ -23,7 +23,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -43,7 +43,7 @@ from visloc.archive import (
 from visloc.archive.schema import Extent
 from visloc.archive.sets import joined_extent
 from visloc.retrieval.inverted import MadeLists
-from visloc.sets.coarse import TILE_LISTS, CoarseModel, DescribedTile, coarse_index, described
+from visloc.sets.coarse import TILE_LISTS, CoarseModel, coarse_index, described
 
 TILE_M = 25.0
 # How far its photos see: a street, or a large room.
@@ -51,6 +51,7 @@ REACH_M = 10.0
 BLOCK_TILES = 50
 # Tiles that the similarities are measured of, as many for each query.
 COMPARED_TILES, QUERIES_OF_TILE = 150, 4
+PARTS = [field.name for field in fields(MadeLists)]
 
 
 def main(
@@ -112,7 +113,7 @@ def make_set(folder: Path, city: City, model: CoarseModel) -> Path:
     return made
 
 
-def described_tiles(blocks: Path, city: City, model: CoarseModel) -> Iterator[DescribedTile]:
+def described_tiles(blocks: Path, city: City, model: CoarseModel) -> Iterator[MadeLists]:
     """Describe the tiles, block by block; those in the folder are read."""
     for first in range(0, city.num_tiles, BLOCK_TILES):
         path = blocks / f"{first:06}.npz"
@@ -120,17 +121,11 @@ def described_tiles(blocks: Path, city: City, model: CoarseModel) -> Iterator[De
         if not path.exists():
             made = [described(city.tile(tile).rows, model) for tile in tiles]
             unfinished = path.with_suffix(".unfinished.npz")
-            np.savez(
-                unfinished,
-                centers=np.array([tile.centers for tile in made]),
-                sizes=np.array([tile.lists.sizes for tile in made]),
-                codes=np.array([tile.lists.codes for tile in made]),
-                ids=np.array([tile.lists.ids for tile in made]),
-            )
+            parts = {name: np.array([getattr(tile, name) for tile in made]) for name in PARTS}
+            np.savez(unfinished, allow_pickle=False, **parts)
             unfinished.rename(path)
         with np.load(path) as arrays:
-            lists = map(MadeLists, arrays["sizes"], arrays["codes"], arrays["ids"])
-            yield from map(DescribedTile, arrays["centers"], lists)
+            yield from map(MadeLists, *(arrays[name] for name in PARTS))
         typer.echo(f"\r{tiles.stop} of {city.num_tiles} tiles", err=True, nl=False)
     typer.echo(err=True)
 

@@ -17,7 +17,7 @@ from mapping.report.held_out import spread_photos
 from visloc.archive import CoarseIndex, Map
 from visloc.localization.geometry.constraints import MapGeometry
 from visloc.sets.choosing import TileScore, plan
-from visloc.sets.coarse import photo_descriptor, ranked, score_without
+from visloc.sets.coarse import descriptor_of, ranked, score_without, words_of
 from visloc.sets.unheard import apart
 
 # Photos that are asked: so many of each tile, of a large set fewer, but at least one.
@@ -51,7 +51,7 @@ def mistaken_for(
         viewpoints = MapGeometry(opened).viewpoints
         for photo in spread_photos(len(opened.images), most):
             left_out = left_out_with(opened, viewpoints, photo)
-            query = photo_descriptor(opened, photo, coarse.model)
+            query = descriptor_of(words_of(opened, photo), coarse.model)
             if left_out is None or not query.any():
                 continue
             asked += 1

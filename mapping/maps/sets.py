@@ -44,9 +44,9 @@ from visloc.geodesy import ecef_from_geodetic, geodetic_from_enu
 from visloc.geometry import Similarity
 from visloc.localization.geometry.constraints import MapGeometry
 from visloc.priors import MAX_TILES
+from visloc.retrieval.inverted import MadeLists
 from visloc.sets.coarse import (
     CoarseModel,
-    DescribedTile,
     coarse_index,
     described,
     descriptors_of,
@@ -203,7 +203,7 @@ def same_content(a: Path, b: Path) -> bool:
 
 def _described(
     folders: Sequence[Path], model: CoarseModel, progress: Progress
-) -> Iterator[DescribedTile]:
+) -> Iterator[MadeLists]:
     progress("coarse index", 0, len(folders))
     for number, folder in enumerate(folders, 1):
         yield described(descriptors_of(open_published(folder), model), model)

@@ -37,10 +37,16 @@ def excluded_photos(
     """
     if photo_weights is None:
         return np.empty(0, dtype=np.int64)
-    excluded = np.asarray(photo_weights == 0, dtype=np.float64)
-    others = retrieve(query, index, _NUM_PHOTOS, excluded, fusion)
+    # Ranked among all photos: of the excluded ones alone, often none looks like the query, which
+    # takes longest to find out. Besides a photo that counts, at most four allowed and four excluded
+    # ones are as good.
+    everywhere = retrieve(query, index, 2 * _NUM_PHOTOS - 1, fusion=fusion)
+    others = np.flatnonzero(photo_weights[everywhere.images] == 0)[:_NUM_PHOTOS]
     # Fuse both lists together: scores that are ranks only compare within one ranking.
-    both, num = (retrieved.similarities, others.similarities), len(retrieved.images)
-    scores = fusion.scores({name: np.concatenate([f[name] for f in both]) for name in query})
+    similarities = {
+        name: np.concatenate([retrieved.similarities[name], everywhere.similarities[name][others]])
+        for name in query
+    }
+    scores, num = fusion.scores(similarities), len(retrieved.images)
     best = np.sort(scores[:num])[::-1][:_NUM_PHOTOS]
-    return np.asarray(others.images[scores[num:] > best.min(initial=np.inf)])
+    return np.asarray(everywhere.images[others[scores[num:] > best.min(initial=np.inf)]])

@@ -140,19 +140,15 @@ def _compared(
     if left <= _MAX_ALLOWED_EXACT:
         photos = np.flatnonzero(allowed)
         return photos, _cosines(query, index, photos)
-    count, lists = max(_MIN_PROPOSED, _PROPOSED_PER_RESULT * top_k), _LISTS
-    many = left > _MAX_DOUBTFUL
-    if many:
-        # Photos that priors leave may lie in lists further away. If there are few, checking
-        # doubtful proposals is cheaper than more lists.
-        lists = math.ceil(lists * len(allowed) / left)
-    photos, limits = _proposed(query, files, allowed, min(left, count), lists)
+    count, many = max(_MIN_PROPOSED, _PROPOSED_PER_RESULT * top_k), left > _MAX_DOUBTFUL
+    photos, limits = _proposed(query, files, allowed, min(left, count), _LISTS)
     cosines = _cosines(query, index, photos)
     if _num_outstanding(cosines, limits, fusion) >= (top_k / 2 if many else top_k):
         return photos, cosines
     if many:
-        count, lists = min(left, _WIDER_PROPOSED * count), _WIDER_LISTS * lists
-        photos, limits = _proposed(query, files, allowed, count, lists)
+        # Photos that priors leave may lie in lists further away.
+        lists = math.ceil(_WIDER_LISTS * _LISTS * len(allowed) / left)
+        photos, limits = _proposed(query, files, allowed, min(left, _WIDER_PROPOSED * count), lists)
         if _ABOVE_ALL not in limits.values():
             return photos, _cosines(query, index, photos)
     return _best_by_codes(query, index, files, top_k, allowed, fusion)

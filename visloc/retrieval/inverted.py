@@ -46,11 +46,13 @@ class MadeLists:
     """The lists of an inverted file, to be written.
 
     Attributes:
+        centers: (C, D') float32, one row for each list.
         sizes: (C,) int64 rows of each list.
         codes: (n, B) uint8, list by list.
         ids: (n,) int64 numbers of the rows, list by list.
     """
 
+    centers: NDArray[np.float32]
     sizes: NDArray[np.int64]
     codes: NDArray[np.uint8]
     ids: NDArray[np.int64]
@@ -233,7 +235,7 @@ def make_lists(rows: Rows, centers: NDArray[np.float32]) -> MadeLists:
         nearest[block] = found
     order = np.argsort(nearest, kind="stable")
     sizes = np.bincount(nearest, minlength=len(centers)).astype(np.int64)
-    return MadeLists(sizes, codes[order], order.astype(np.int64))
+    return MadeLists(centers, sizes, codes[order], order.astype(np.int64))
 
 
 def bytes_of(lists: Iterable[MadeLists]) -> Iterator[bytes]:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -45,23 +44,10 @@ _NUM_BEST = 3
 NO_PIXELS = np.empty((0, 0, 3), np.uint8)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class DescribedTile:
-    """One tile in the index: its lists and their centres, (TILE_LISTS, W) float32."""
-
-    centers: NDArray[np.float32]
-    lists: MadeLists
-
-
-def photo_descriptor(opened: Map, photo: int, model: CoarseModel) -> NDArray[np.float32]:
-    """Return the descriptor (D,) of a photo of a map, from its stored local descriptors."""
-    return descriptor_of(words_of(opened, photo), model)
-
-
 def descriptors_of(opened: Map, model: CoarseModel) -> NDArray[np.float32]:
     """Return the descriptors (n, D) of a map's photos, from their stored local descriptors."""
     photos = range(len(opened.images))
-    return np.array([photo_descriptor(opened, photo, model) for photo in photos])
+    return np.array([descriptor_of(words_of(opened, photo), model) for photo in photos])
 
 
 def descriptor_of(words: NDArray[np.float32], model: CoarseModel) -> NDArray[np.float32]:
@@ -69,8 +55,8 @@ def descriptor_of(words: NDArray[np.float32], model: CoarseModel) -> NDArray[np.
     return localvlad().describe(NO_PIXELS, without_positions(words), model)
 
 
-def described(rows: NDArray[np.float32], model: CoarseModel) -> DescribedTile:
-    """Describe a tile from the descriptors (n, D) of its photos.
+def described(rows: NDArray[np.float32], model: CoarseModel) -> MadeLists:
+    """Make the TILE_LISTS lists of a tile from the descriptors (n, D) of its photos.
 
     ``model`` is that of the set, or of another set with the same local features.
     """
@@ -78,19 +64,19 @@ def described(rows: NDArray[np.float32], model: CoarseModel) -> DescribedTile:
     centers = make_centers(turned, TILE_LISTS)
     # With fewer photos than lists, centres are repeated, and the lists of the copies stay empty.
     centers = centers[np.arange(TILE_LISTS) % len(centers)]
-    return DescribedTile(centers, make_lists(turned, centers))
+    return make_lists(turned, centers)
 
 
-def coarse_index(described: Iterator[DescribedTile], model: CoarseModel, path: Path) -> CoarseIndex:
+def coarse_index(described: Iterator[MadeLists], model: CoarseModel, path: Path) -> CoarseIndex:
     """Make an index of described tiles, and write its lists into a new file."""
     centers, sizes, counts = [], [], [0]
 
     def lists() -> Iterator[MadeLists]:
         for tile in described:
             centers.append(tile.centers)
-            sizes.append(tile.lists.sizes)
-            counts.append(len(tile.lists.ids))
-            yield tile.lists
+            sizes.append(tile.sizes)
+            counts.append(len(tile.ids))
+            yield tile
 
     with path.open("xb") as file:
         file.writelines(bytes_of(lists()))

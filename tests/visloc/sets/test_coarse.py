@@ -16,9 +16,9 @@ from visloc.errors import Conflict, MapCorrupt
 from visloc.features import make_local_features
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
+from visloc.retrieval.inverted import MadeLists
 from visloc.sets.coarse import (
     CoarseModel,
-    DescribedTile,
     check_descriptor,
     coarse_index,
     described,
@@ -37,11 +37,11 @@ def unit(rows: NDArray[np.float64]) -> NDArray[np.float32]:
     return (rows / np.linalg.norm(rows, axis=-1, keepdims=True)).astype(np.float32)
 
 
-def tile_of(rows: NDArray[np.float32]) -> DescribedTile:
+def tile_of(rows: NDArray[np.float32]) -> MadeLists:
     return described(rows, MODEL)
 
 
-def joined(tiles: Sequence[DescribedTile], folder: Path, model: CoarseModel) -> CoarseIndex:
+def joined(tiles: Sequence[MadeLists], folder: Path, model: CoarseModel) -> CoarseIndex:
     return coarse_index(iter(tiles), model, folder / f"lists-{uuid4()}")
 
 
