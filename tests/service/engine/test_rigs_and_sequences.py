@@ -404,7 +404,7 @@ def test_instants_without_images_live_on_odometry(with_engine: WithEngine, query
 def test_a_sequence_does_not_queue_behind_all_photos_for_each_of_its_tasks(
     built_maps: Path, query: Query
 ) -> None:
-    clients, instants = 16, instants_of([query.image] * 4, query.camera)
+    clients, instants = 30, instants_of([query.image] * 4, query.camera)
 
     photo = replace(job_for(query), options=FAST)
 
@@ -419,7 +419,7 @@ def test_a_sequence_does_not_queue_behind_all_photos_for_each_of_its_tasks(
 
         asking = [asyncio.create_task(ask_on()) for _ in range(clients)]
         try:
-            await until(lambda: answered >= clients)
+            await until(lambda: answered > 0)
             before = answered
             assert all(each.answer.pose for each in await answers_of(engine, START, instants))
             # It takes a dozen tasks, or thrice as many photos of each client as there are instants.
