@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from service.descriptors import fit_connections
 from service.settings import ServiceSettings, SettingsError, read_settings
 from service.telemetry.logs import configure_logging
-from service.telemetry.process_memory import give_back_memory
+from service.telemetry.process_memory import give_back_memory, use_one_heap
 
 if TYPE_CHECKING:
     from service.server import Server
@@ -31,6 +31,7 @@ def main() -> None:
     except SettingsError as error:
         sys.exit(f"visloc-service: {error}")
     configure_logging(settings)
+    use_one_heap()
     try:
         settings = fit_connections(settings)
     except SettingsError as error:

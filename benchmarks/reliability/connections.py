@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import re
 import resource
 import subprocess
 import time
 from collections import Counter
-from collections.abc import Awaitable, Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
@@ -113,18 +114,43 @@ async def _withstood(
     metrics_port = free_port()
     own = certificate(work) if with_tls else None
     before = ["bash", "-c", f'ulimit -n {limit}\nexec "$@"', "-"]
-    with ServiceProcess(
-        maps.folder, log, before=before, certificate=own, metrics_port=metrics_port
-    ) as service:
+    with (
+        _cores_apart() as part,
+        ServiceProcess(
+            maps.folder, log, before=before, certificate=own, metrics_port=metrics_port
+        ) as service,
+    ):
+        part()
         return await _attacked_in_turn(
             where, maps, service, service.addresses, OWN_ADDRESS, metrics_port, strength
         )
 
 
+@contextmanager
+def _cores_apart() -> Iterator[Callable[[], None]]:
+    """Keep the service on one core, and all that asks or attacks it on the others.
+
+    Processes that are started in the block have the first core, until the function that is yielded
+    is called. Otherwise the honest client would wait for the attackers' work too, not only for what
+    the service makes of it. Does nothing on a single core.
+    """
+    cores = os.sched_getaffinity(0)
+    first = {min(cores)}
+    os.sched_setaffinity(0, first)
+    try:
+        yield lambda: os.sched_setaffinity(0, cores - first or cores)
+    finally:
+        os.sched_setaffinity(0, cores)
+
+
 async def behind_balancer(maps: SampleMaps, work: Path, strength: Strength) -> list[Check]:
     """Attack a service through the balancer that comes with it, all from one address."""
     metrics_port = free_port()
-    with balanced([maps.folder], work, metrics_port=metrics_port) as found:
+    with (
+        _cores_apart() as part,
+        balanced([maps.folder], work, metrics_port=metrics_port) as found,
+    ):
+        part()
         [service], http_port = found.replicas, int(found.http.rpartition(":")[2])
         front = Addresses(found.http, http_port, found.grpc.removeprefix("grpc://"))
         return await _attacked_in_turn(
@@ -166,11 +192,13 @@ async def _attack(besieged: Besieged, attack: Attack, strength: Strength) -> tup
     number = FLOODING if attack.is_flood else strength.count // attack.one_in
     has_tls = front.trust is not None
     assault = Assault(attack.name, port, number, has_tls, strength.pause_s, besieged.source)
+    worked_s = service.processor_seconds()
     async with attacked([assault]) as seen:
         await asyncio.sleep(1)
         probes = asyncio.create_task(probed(besieged, seconds))
         beside = await ask_in_turn(doors, cases, 1, seconds, seed)
         found = await probes
+        worked_s = service.processor_seconds() - worked_s
         open_files = len(list(Path(f"/proc/{service.pid}/fd").iterdir()))
     lines = _lines(service.log) - lines
     late = {name: sum(each > PROBE_LIMIT_S for each in took) for name, took in found.items()}
@@ -187,7 +215,7 @@ async def _attack(besieged: Besieged, attack: Attack, strength: Strength) -> tup
         f"{slowest:.2f} s; p90 {p90(beside) * 1e3:.0f} ms, alone {p90(alone) * 1e3:.0f} ms: "
         f"{ratio:.2f} times, {len(beside)} answers, {len(wrong)} wrong, {len(lost)} to ask again; "
         f"{lines} log lines; "
-        f"{open_files} files; {counts_text(seen)}",
+        f"{open_files} files; {worked_s:.1f} s of processor of the service; {counts_text(seen)}",
         not any(late.values()) and ratio <= MOST_P90 and lines <= MOST_LOG_LINES and not wrong,
     )
 

@@ -227,9 +227,16 @@ class Catalog:
             try:
                 return await self._hold(found)
             except NotFound:
+                if "@" in ref:
+                    raise
+                # Another server may have replaced and deleted it, while this one still opens its
+                # successor.
+                await self._resolve(ref)
+                served = self._maps.get(ref)
+                if served is not None and served.taking_over is not None:
+                    await asyncio.shield(served.taking_over)
                 if self._served_ref(ref) in (None, found):
                     raise
-                # Another version took over meanwhile.
 
     async def _hold(self, ref: str) -> MapFolder:
         """Return ``id@version``, which stays open until it is released."""

@@ -27,7 +27,7 @@ from service.values import (
     WorkerSettings,
 )
 from service.workers.judging import gated, judged
-from service.workers.pool import Workers
+from service.workers.pool import Turn, Workers, using_turn
 from service.workers.tasks import Vision
 from visloc.archive import MapStore
 from visloc.errors import VislocError, refuse
@@ -225,7 +225,9 @@ class Engine:
             searches = [self._sets.localize(job, each) for each in sets]
             if alone:
                 searches.append(localize_in(self.workers, job, alone))
-            return gated(judged(await answers_of(searches), job.priors)[1], job.options)
+            with using_turn(Turn()):
+                found = await answers_of(searches)
+            return gated(judged(found, job.priors)[1], job.options)
 
     async def localize_sequence(
         self, start: SequenceJob, instants: AsyncIterator[InstantJob] | Sequence[InstantJob]
@@ -260,7 +262,12 @@ class Engine:
             else:
                 found = answers_in_maps(self.workers, start, instants, alone)
             async with aclosing(found) as answers:
-                async for answer in answers:
+                turn = Turn()  # asked of each time: another task of asyncio may take an answer
+                while True:
+                    with using_turn(turn):
+                        answer = await anext(answers, None)
+                    if answer is None:
+                        return
                     yield answer
 
     async def maps(self, near: Near | None = None) -> Sequence[ServedMap]:

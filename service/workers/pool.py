@@ -1,5 +1,7 @@
 """A pool of worker processes: always warm, replaced when they die, one task at a time each.
 
+Tasks queue by request (``Turn``), not by the time at which they were queued.
+
 Native code can end a process without an exception; only the request in that process is lost. Each
 process has an executor of its own, because the standard one fails all its tasks when one process
 dies (docs/decisions/0013-worker-processes.md).
@@ -14,13 +16,17 @@ import logging
 import os
 import signal
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import suppress
-from dataclasses import dataclass
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from heapq import heapify, heappop, heappush
+from itertools import count as numbers
 from multiprocessing import get_context
 from operator import methodcaller
+from time import monotonic
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from service.errors import stopping_error
@@ -46,15 +52,62 @@ _RESTART_PAUSE_S = 1.0
 # Longest time for a process to begin and to open the maps that are in service.
 _START_LIMIT_S = 300.0
 _PING = methodcaller(str(Vision.ping))
+# The seconds by which a request falls back in the queue for each second that workers spent on it.
+# Twice as many as there are sequences at once by default: all together then take at most half of a
+# worker from photos that wait.
+_SETBACK = 16.0
+# The longest time that a request may have been in the queue already, where its next task is queued.
+# A stream that was silent for an hour must not overtake all others for minutes.
+_MOST_CREDIT_S = 60.0
 
 
-@dataclass(eq=False)
+@dataclass
+class Turn:
+    """The place of a request in the queue, which its tasks have one after the other.
+
+    A sequence of a few photos takes a dozen tasks. If each queued behind all photos that came
+    before it, a queue of five seconds would take a minute.
+
+    Attributes:
+        since: when the request began, and later by what workers have spent on it.
+    """
+
+    since: float = field(default_factory=monotonic)
+
+    def rank(self) -> float:
+        """Return the rank of the next task: the least comes first, none is behind a new request."""
+        now = monotonic()
+        self.since = max(self.since, now - _MOST_CREDIT_S)
+        return min(now, self.since)
+
+    def worked(self, seconds: float) -> None:
+        """Let the request fall back by what a worker has spent on it."""
+        self.since += _SETBACK * seconds
+
+
+_turn: ContextVar[Turn | None] = ContextVar("turn", default=None)
+
+
+@contextmanager
+def using_turn(turn: Turn) -> Iterator[None]:
+    """Give a turn to all that is run in the block, also by tasks of asyncio that begin in it."""
+    token = _turn.set(turn)
+    try:
+        yield
+    finally:
+        _turn.reset(token)
+
+
+@dataclass(order=True)
 class _Queued:
-    """A task, the future of its result, and the worker that runs it now."""
+    """A task, the future of its result, and the worker that runs it now; the least comes first."""
 
-    task: Task[Any]
-    answer: asyncio.Future[Any]
-    worker: _Worker | None = None
+    rank: float
+    number: int
+    turn: Turn = field(compare=False)
+    task: Task[Any] = field(compare=False)
+    answer: asyncio.Future[Any] = field(compare=False)
+    worker: _Worker | None = field(default=None, compare=False)
 
 
 class Workers:
@@ -82,7 +135,8 @@ class Workers:
         self._limit_s = limit_s
         self._warm = warm
         self._on_death = on_death
-        self._queue: deque[_Queued] = deque()
+        self._queue: list[_Queued] = []  # a heap
+        self._numbers = numbers()
         self._changed = asyncio.Condition()
         self._serving: list[asyncio.Task[None]] = []
         self._closed = False
@@ -140,9 +194,9 @@ class Workers:
         if self._closed:  # nobody would ever take it: uploads are verified until then
             raise stopping_error()
         task: Task[T] = methodcaller(str(method), *args, **kwargs)
-        queued = _Queued(task, asyncio.get_running_loop().create_future())
+        queued = self._queued(task, _turn.get() or Turn())
         async with self._changed:
-            self._queue.append(queued)
+            heappush(self._queue, queued)
             self._changed.notify_all()
         try:
             result: T = await queued.answer
@@ -152,6 +206,7 @@ class Workers:
             else:
                 with suppress(ValueError):  # it has just ended
                     self._queue.remove(queued)
+                    heapify(self._queue)
             raise
         return result
 
@@ -160,8 +215,7 @@ class Workers:
     ) -> None:
         """Run a task once in every process, before queued tasks; log its errors."""
         task: Task[T] = methodcaller(str(method), *args, **kwargs)
-        loop = asyncio.get_running_loop()
-        errands = [_Queued(task, loop.create_future()) for _ in self._workers]
+        errands = [self._queued(task, Turn()) for _ in self._workers]
         async with self._changed:
             for one, errand in zip(self._workers, errands, strict=True):
                 one.errands.append(errand)
@@ -169,6 +223,10 @@ class Workers:
         for found in await asyncio.gather(*(e.answer for e in errands), return_exceptions=True):
             if isinstance(found, BaseException):
                 logger.warning("a worker process could not %s: %s", method, found)
+
+    def _queued(self, task: Task[Any], turn: Turn) -> _Queued:
+        answer = asyncio.get_running_loop().create_future()
+        return _Queued(turn.rank(), next(self._numbers), turn, task, answer)
 
     async def close(self) -> None:
         """End all processes at once; queued and running tasks raise ``server.stopping``."""
@@ -195,7 +253,7 @@ class Workers:
                 await self._replace(one)
 
     async def _work_on(self, one: _Worker, queued: _Queued) -> None:
-        queued.worker = one
+        queued.worker, started = one, monotonic()
         try:
             threads = share_of_cores(self._cores, self.running + 1, self._most_threads)
             result = await one.run(self._limit_s, queued.task, threads)
@@ -210,6 +268,7 @@ class Workers:
             if not queued.answer.done():
                 queued.answer.set_result(result)
         finally:
+            queued.turn.worked(monotonic() - started)
             queued.worker = None  # it may take another task before the caller sees the result
 
     async def _next(self, one: _Worker) -> _Queued | None:
@@ -217,7 +276,7 @@ class Workers:
         try:
             async with asyncio.timeout(_WATCH_S), self._changed:
                 await self._changed.wait_for(lambda: one.errands or self._queue)
-                return one.errands.popleft() if one.errands else self._queue.popleft()
+                return one.errands.popleft() if one.errands else heappop(self._queue)
         except TimeoutError:
             return None
 

@@ -70,6 +70,24 @@ def test_a_published_version_and_a_new_map_are_served_without_a_restart(
     run(play())
 
 
+def test_a_version_that_another_server_replaced_and_deleted_gives_way_to_its_successor(
+    maps_dir: Path, query: Query
+) -> None:
+    async def play() -> None:
+        engine = make(maps_dir)
+        await engine.start()
+        old = (await engine.localize(job_for(query))).map_version
+        with held_back(engine):  # so that it cannot open the new version yet
+            publish(maps_dir, "v2")
+            MapStore(maps_dir).remove("room", old)
+            asking = asyncio.create_task(engine.localize(job_for(query)))
+            await asyncio.wait({asking}, timeout=0.5)
+        assert (await asking).map_version == "v2"
+        await engine.close()
+
+    run(play())
+
+
 def test_a_broken_new_version_leaves_the_one_before_in_service(
     maps_dir: Path, query: Query, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -401,6 +401,38 @@ def test_instants_without_images_live_on_odometry(with_engine: WithEngine, query
     with_engine(play)
 
 
+def test_a_sequence_does_not_queue_behind_all_photos_for_each_of_its_tasks(
+    built_maps: Path, query: Query
+) -> None:
+    clients, instants = 30, instants_of([query.image] * 4, query.camera)
+
+    photo = replace(job_for(query), options=FAST)
+
+    async def play(engine: Engine) -> None:
+        answered = 0
+
+        async def ask_on() -> None:
+            nonlocal answered
+            while True:
+                await engine.localize(photo)
+                answered += 1
+
+        asking = [asyncio.create_task(ask_on()) for _ in range(clients)]
+        try:
+            await until(lambda: answered > 0)
+            before = answered
+            assert all(each.answer.pose for each in await answers_of(engine, START, instants))
+            # It takes a dozen tasks, or thrice as many photos of each client as there are instants.
+            assert answered - before < 2 * len(instants) * clients
+        finally:
+            for each in asking:
+                each.cancel()
+            await asyncio.gather(*asking, return_exceptions=True)
+
+    with started(built_maps, max_queue=clients) as with_engine:
+        with_engine(play)
+
+
 def test_batches_have_places_of_their_own(built_maps: Path) -> None:
     engine = make(built_maps, max_batches=2)
     with pytest.raises(Unavailable) as early, engine.admit_batch():

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from service.workers.pool import share_of_cores
+from service.workers.pool import Turn, share_of_cores
 
 
 @pytest.mark.parametrize(
@@ -21,3 +21,18 @@ def test_photos_that_are_localized_at_the_same_time_share_the_cores(
     cores: int, running: int, most: int, threads: int
 ) -> None:
     assert share_of_cores(cores, running, most) == threads
+
+
+def test_a_request_falls_back_by_what_was_spent_on_it_but_not_behind_new_ones() -> None:
+    earlier, later = Turn(), Turn()
+    assert earlier.rank() < later.rank()
+    earlier.worked(0.1)
+    assert later.rank() < earlier.rank() <= Turn().rank()
+
+
+def test_a_silent_stream_earns_no_right_to_overtake_all_others() -> None:
+    silent = Turn(since=Turn().since - 3600.0)
+    waiting = Turn(since=Turn().since - 30.0)
+    silent.rank()
+    silent.worked(3.0)
+    assert waiting.rank() < silent.rank()
