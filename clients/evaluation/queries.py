@@ -70,7 +70,8 @@ def read_queries(
 
     Raises:
         DatasetError: codes ``kapture.*``, ``list.*``, ``camera.*``; ``queries.missing`` when
-            there is nothing at ``source`` or no folder at ``image_root``, ``queries.empty`` when it holds no photo.
+            there is nothing at ``source`` or no folder at ``image_root``, ``queries.empty`` when
+            it holds no photo.
         InvalidInput: ``queries.image_root`` for a kapture folder.
     """
     if source.is_dir():
