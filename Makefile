@@ -10,7 +10,7 @@ PAGE_SOURCES := $(shell find web/src web/client/src web/*.html web/*.json web/cl
 .DEFAULT_GOAL := help
 # Vite needs this much; without it the service has no page, and says so.
 NODE_IS_THERE = command -v npm >/dev/null && node -e 'const [a, b] = process.versions.node.split(".").map(Number); process.exit(a > 22 || (a === 22 && b >= 12) || (a === 20 && b >= 19) ? 0 : 1)'
-.PHONY: help install licences-check page check-page browser balancer promtool demo test test-all docs-check docs-errors docs-options licences lock sbom audit fuzz fuzz-api train-smoke bench bench-gpu bench-scale bench-change trust fmt lint types contracts proto proto-check site docs-links check serve clean
+.PHONY: help install licences-check page check-page browser balancer promtool demo test test-all docs-check docs-errors docs-options licences lock sbom audit fuzz fuzz-api train-smoke bench bench-gpu bench-scale bench-change results trust fmt lint types contracts proto proto-check site docs-links check serve clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "%-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)

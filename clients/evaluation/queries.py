@@ -70,13 +70,20 @@ def read_queries(
 
     Raises:
         DatasetError: codes ``kapture.*``, ``list.*``, ``camera.*``; ``queries.missing`` when
-            there is nothing at ``source``, ``queries.empty`` when it holds no photo.
+            there is nothing at ``source`` or no folder at ``image_root``, ``queries.empty`` when
+            it holds no photo.
         InvalidInput: ``queries.image_root`` for a kapture folder.
     """
     if source.is_dir():
         if image_root is not None:
             raise refuse("queries.image_root", field="image_root", got=str(image_root))
         queries = _read_kapture(source, origin)
+    elif image_root is not None and not image_root.is_dir():
+        raise refuse(
+            "queries.missing",
+            field=str(image_root),
+            expected="the folder of the photos of the list",
+        )
     elif lists := _lists_of(source):
         queries = QuerySet(source, tuple(_read_lists(lists, origin, image_root)), {})
     else:

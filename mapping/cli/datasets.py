@@ -130,7 +130,9 @@ def dataset(
 ) -> None:
     """Make mapping and query datasets of a public data set, by its own split.
 
-    Photos are links to the archive, which must stay where it is.
+    Photos are links to the archive, which must stay where it is. There is no reader of InLoc: no
+    public source tells how the pose of a cut-out follows from that of its scan. kapture's copy of
+    it needs no reader.
     """
     for part, made in write_parts(name, folder, output).items():
         say(f"{len(made.images)} photos: {output / part}")

@@ -25,13 +25,14 @@ from mapping.frames.georeference import (
     publish_anchored,
     read_correspondences,
 )
+from mapping.frames.kept_fixes import contradiction_of_fixes
 from mapping.maps.export import EXPORTERS, Queries, export_map
 from mapping.maps.packing import write_packed
 from mapping.maps.upgrading import lacking, upgrade_map
 from mapping.options import Gravity, MapArgument, MapsDirOption, WeightsDirOption
 from mapping.progress import one_step
 from mapping.stages.imported_points import read_imported_points
-from visloc.archive import Map, SetManifest, open_map, open_set, verify_map, verify_set
+from visloc.archive import Anchor, Map, SetManifest, open_map, open_set, verify_map, verify_set
 from visloc.archive.checks import read_any_manifest
 from visloc.errors import refuse
 from visloc.features import make_global_descriptor, make_local_features
@@ -145,6 +146,7 @@ def anchor(
     opened = open_map(map_folder(settings.map_ref, maps_dir))
     found = settings.located(opened)
     print_georeference(found)
+    _say_contradiction(opened, found.anchor)
     folder = publish_anchored(opened, found, maps_dir, force=force)
     say(f"map {open_map(folder).ref}")
 
@@ -256,6 +258,14 @@ def verify(
     Localizer(opened, extractor, make_descriptor)  # raises when they differ
     names = (name, *(record.fingerprint.name for record in opened.manifest.global_features))
     say(f"{', '.join(names)}: the same features as here")
+    if opened.manifest.world.anchor is not None:
+        _say_contradiction(opened, opened.manifest.world.anchor)
+
+
+def _say_contradiction(opened: Map, anchor: Anchor) -> None:
+    contradiction = contradiction_of_fixes(opened, anchor)
+    if contradiction is not None:
+        say_notes([contradiction])
 
 
 @contextmanager

@@ -26,6 +26,11 @@ READERS: Mapping[str, Reader] = {
     "robotcar": read_robotcar,
     "cmu": read_cmu,
 }
+# Sets of the paper without a reader, and why.
+WITHOUT_READER: Mapping[str, str] = {
+    "inloc": "no public source tells how the pose of a cut-out follows from that of its scan; use "
+    "kapture's copy of InLoc as it is",
+}
 
 
 def write_parts(name: str, folder: Path, output: Path) -> Mapping[str, Dataset]:
@@ -46,7 +51,9 @@ def write_parts(name: str, folder: Path, output: Path) -> Mapping[str, Dataset]:
     """
     reader = READERS.get(name)
     if reader is None:
-        raise refuse("archive.unknown", field="SET", expected=READERS, got=name)
+        why = WITHOUT_READER.get(name)
+        got = name if why is None else f"{name}: {why}"
+        raise refuse("archive.unknown", field="SET", expected=READERS, got=got)
     if not folder.is_dir():
         raise refuse("archive.missing", field=str(folder), expected="the unpacked archive")
     parts = reader(folder)

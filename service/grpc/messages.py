@@ -36,9 +36,13 @@ def near_of(request: pb2.ListMapsRequest) -> Near | None:
     """Return the circle into which the maps must reach, if any.
 
     Raises:
-        InvalidInput: ``near...``.
+        InvalidInput: ``near...`` or ``request.missing_field``.
     """
-    return near.Near.read(_plain(request.near)).to_core() if request.HasField("near") else None
+    if not request.HasField("near"):
+        return None
+    with inside("near"):
+        words = near.Near.read(_plain(request.near))
+    return words.to_core()
 
 
 def localize_job_of(request: pb2.LocalizeRequest, max_bytes: int) -> RigJob:

@@ -306,6 +306,7 @@ class Localizer:
             sent = checked_global_descriptors(features, self.map.manifest, optional)
         seen = query_resolution(camera, CameraSource.GIVEN)
         reduced = self.geometry.resolution.finer(seen)
+        self._named.check_matched(features.matches)
         matches = sent_matches(features, local)
         local = local.reduced(reduced)
         found = _Features(local, sent, _NO_PIXELS, evidence, seconds, reduced, matches)

@@ -477,7 +477,9 @@ class GnssPrior(_message.Message):
     ALTITUDE_FIELD_NUMBER: _builtins.int
     VERTICAL_ACCURACY_FIELD_NUMBER: _builtins.int
     latitude: _builtins.float
-    """degrees, WGS84"""
+    """Required. They have presence so that one that is left out is not read as 0.
+    degrees, WGS84
+    """
     longitude: _builtins.float
     """degrees"""
     accuracy: _builtins.float
@@ -489,22 +491,34 @@ class GnssPrior(_message.Message):
     def __init__(
         self,
         *,
-        latitude: _builtins.float = ...,
-        longitude: _builtins.float = ...,
-        accuracy: _builtins.float = ...,
+        latitude: _builtins.float | None = ...,
+        longitude: _builtins.float | None = ...,
+        accuracy: _builtins.float | None = ...,
         altitude: _builtins.float | None = ...,
         vertical_accuracy: _builtins.float | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_altitude", b"_altitude", "_vertical_accuracy", b"_vertical_accuracy", "altitude", b"altitude", "vertical_accuracy", b"vertical_accuracy"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_accuracy", b"_accuracy", "_altitude", b"_altitude", "_latitude", b"_latitude", "_longitude", b"_longitude", "_vertical_accuracy", b"_vertical_accuracy", "accuracy", b"accuracy", "altitude", b"altitude", "latitude", b"latitude", "longitude", b"longitude", "vertical_accuracy", b"vertical_accuracy"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_altitude", b"_altitude", "_vertical_accuracy", b"_vertical_accuracy", "accuracy", b"accuracy", "altitude", b"altitude", "latitude", b"latitude", "longitude", b"longitude", "vertical_accuracy", b"vertical_accuracy"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_accuracy", b"_accuracy", "_altitude", b"_altitude", "_latitude", b"_latitude", "_longitude", b"_longitude", "_vertical_accuracy", b"_vertical_accuracy", "accuracy", b"accuracy", "altitude", b"altitude", "latitude", b"latitude", "longitude", b"longitude", "vertical_accuracy", b"vertical_accuracy"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__accuracy: _TypeAlias = _typing.Literal["accuracy"]  # noqa: Y015
+    _WhichOneofArgType__accuracy: _TypeAlias = _typing.Literal["_accuracy", b"_accuracy"]  # noqa: Y015
     _WhichOneofReturnType__altitude: _TypeAlias = _typing.Literal["altitude"]  # noqa: Y015
     _WhichOneofArgType__altitude: _TypeAlias = _typing.Literal["_altitude", b"_altitude"]  # noqa: Y015
+    _WhichOneofReturnType__latitude: _TypeAlias = _typing.Literal["latitude"]  # noqa: Y015
+    _WhichOneofArgType__latitude: _TypeAlias = _typing.Literal["_latitude", b"_latitude"]  # noqa: Y015
+    _WhichOneofReturnType__longitude: _TypeAlias = _typing.Literal["longitude"]  # noqa: Y015
+    _WhichOneofArgType__longitude: _TypeAlias = _typing.Literal["_longitude", b"_longitude"]  # noqa: Y015
     _WhichOneofReturnType__vertical_accuracy: _TypeAlias = _typing.Literal["vertical_accuracy"]  # noqa: Y015
     _WhichOneofArgType__vertical_accuracy: _TypeAlias = _typing.Literal["_vertical_accuracy", b"_vertical_accuracy"]  # noqa: Y015
     @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__accuracy) -> _WhichOneofReturnType__accuracy | None: ...
+    @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__altitude) -> _WhichOneofReturnType__altitude | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__latitude) -> _WhichOneofReturnType__latitude | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__longitude) -> _WhichOneofReturnType__longitude | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__vertical_accuracy) -> _WhichOneofReturnType__vertical_accuracy | None: ...
 
@@ -588,7 +602,9 @@ class Near(_message.Message):
     LONGITUDE_FIELD_NUMBER: _builtins.int
     RADIUS_FIELD_NUMBER: _builtins.int
     latitude: _builtins.float
-    """degrees, WGS84"""
+    """Required. They have presence so that one that is left out is not read as 0.
+    degrees, WGS84
+    """
     longitude: _builtins.float
     """degrees"""
     radius: _builtins.float
@@ -596,15 +612,26 @@ class Near(_message.Message):
     def __init__(
         self,
         *,
-        latitude: _builtins.float = ...,
-        longitude: _builtins.float = ...,
-        radius: _builtins.float = ...,
+        latitude: _builtins.float | None = ...,
+        longitude: _builtins.float | None = ...,
+        radius: _builtins.float | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_latitude", b"_latitude", "_longitude", b"_longitude", "_radius", b"_radius", "latitude", b"latitude", "longitude", b"longitude", "radius", b"radius"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["latitude", b"latitude", "longitude", b"longitude", "radius", b"radius"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_latitude", b"_latitude", "_longitude", b"_longitude", "_radius", b"_radius", "latitude", b"latitude", "longitude", b"longitude", "radius", b"radius"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    def WhichOneof(self, oneof_group: _Never) -> None: ...
+    _WhichOneofReturnType__latitude: _TypeAlias = _typing.Literal["latitude"]  # noqa: Y015
+    _WhichOneofArgType__latitude: _TypeAlias = _typing.Literal["_latitude", b"_latitude"]  # noqa: Y015
+    _WhichOneofReturnType__longitude: _TypeAlias = _typing.Literal["longitude"]  # noqa: Y015
+    _WhichOneofArgType__longitude: _TypeAlias = _typing.Literal["_longitude", b"_longitude"]  # noqa: Y015
+    _WhichOneofReturnType__radius: _TypeAlias = _typing.Literal["radius"]  # noqa: Y015
+    _WhichOneofArgType__radius: _TypeAlias = _typing.Literal["_radius", b"_radius"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__latitude) -> _WhichOneofReturnType__latitude | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__longitude) -> _WhichOneofReturnType__longitude | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__radius) -> _WhichOneofReturnType__radius | None: ...
 
 Global___Near: _TypeAlias = Near  # noqa: Y015
 

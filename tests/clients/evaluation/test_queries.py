@@ -51,6 +51,10 @@ def test_lists_of_a_pattern_are_one_with_names_below_the_image_root(tmp_path: Pa
         (tmp_path / "queries" / f"{name}_with_intrinsics.txt").write_text(line)
     (tmp_path / "queries" / "other.txt").write_text("not a list\n")
     root = tmp_path / "images_upright"
+    with pytest.raises(DatasetError, match="images_upright") as caught:
+        read_queries(tmp_path / "queries" / "*_with_intrinsics.txt", image_root=root)
+    assert caught.value.code == "queries.missing"
+    root.mkdir()
 
     queries = read_queries(tmp_path / "queries" / "*_with_intrinsics.txt", image_root=root)
 

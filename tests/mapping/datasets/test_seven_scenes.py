@@ -104,6 +104,12 @@ def test_existing_output_stays(scene: Path, tmp_path: Path) -> None:
 def test_other_sets_are_refused_by_name(scene: Path, tmp_path: Path) -> None:
     with pytest.raises(InvalidInput) as caught:
         write_parts("8scenes", scene, tmp_path / "out")
+    assert (caught.value.code, caught.value.got) == ("archive.unknown", "8scenes")
+
+
+def test_inloc_is_refused_with_the_reason(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInput, match="kapture's copy of InLoc") as caught:
+        write_parts("inloc", tmp_path, tmp_path / "out")
     assert caught.value.code == "archive.unknown"
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import base64
 import json
+import struct
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,13 @@ import pytest
 
 from service.api import jobs
 from service.api.answers import instant_answer
-from service.grpc.messages import instant_of, rig_job_of, sequence_start_of
+from service.grpc.messages import (
+    instant_of,
+    localize_job_of,
+    near_of,
+    rig_job_of,
+    sequence_start_of,
+)
 from service.grpc.reading import reader_of
 from service.http.bodies import max_sequence_values
 from service.settings import ServiceSettings
@@ -583,3 +590,48 @@ def test_a_wrong_message_of_a_stream_is_refused(message: Any, code: str, field: 
         instant_of(message, LIMITS, 4, has_rig=True)
     assert caught.value.code == code
     assert field is None or caught.value.field == field
+
+
+# Places on Earth in messages of gRPC: 0 is a place, and what is left out is none.
+
+FIX = {"latitude": 0.0, "longitude": 0.0, "accuracy": 4.0}
+
+
+def test_a_fix_at_zero_degrees_that_is_sent_is_read() -> None:
+    priors = pb2.Priors(gnss=pb2.GnssPrior(**FIX))
+    job = localize_job_of(pb2.LocalizeRequest(map="a", image=b"photo", priors=priors), 1000)
+    assert job.priors.gnss is not None
+    assert (job.priors.gnss.latitude, job.priors.gnss.longitude) == (0.0, 0.0)
+    request = pb2.ListMapsRequest(near=pb2.Near(latitude=0.0, longitude=0.0, radius=5.0))
+    near = near_of(pb2.ListMapsRequest.FromString(request.SerializeToString()))
+    assert near is not None
+    assert (near.latitude, near.longitude, near.radius) == (0.0, 0.0, 5.0)
+
+
+@pytest.mark.parametrize("left_out", sorted(FIX))
+def test_a_part_of_a_fix_that_is_left_out_is_named(left_out: str) -> None:
+    parts = {name: value for name, value in FIX.items() if name != left_out}
+    priors = pb2.Priors(gnss=pb2.GnssPrior(**parts))
+    with pytest.raises(InvalidInput) as caught:
+        localize_job_of(pb2.LocalizeRequest(map="a", image=b"photo", priors=priors), 1000)
+    assert caught.value.code == "request.missing_field"
+    assert caught.value.field == f"priors.gnss.{left_out}"
+
+
+@pytest.mark.parametrize("left_out", ["latitude", "longitude", "radius"])
+def test_a_part_of_a_circle_that_is_left_out_is_named(left_out: str) -> None:
+    parts = {"latitude": 1.0, "longitude": 1.0, "radius": 5.0}
+    del parts[left_out]
+    with pytest.raises(InvalidInput) as caught:
+        near_of(pb2.ListMapsRequest(near=pb2.Near(**parts)))
+    assert (caught.value.code, caught.value.field) == ("request.missing_field", f"near.{left_out}")
+
+
+def test_bytes_of_a_fix_are_what_they_were_before_its_parts_had_presence() -> None:
+    # Fields 1 to 3, each eight bytes.
+    old = b"".join(
+        bytes([number << 3 | 1]) + struct.pack("<d", value)
+        for number, value in enumerate((48.1, -8.2, 4.5), 1)
+    )
+    assert pb2.GnssPrior(latitude=48.1, longitude=-8.2, accuracy=4.5).SerializeToString() == old
+    assert pb2.Near(latitude=48.1, longitude=-8.2, radius=4.5).SerializeToString() == old

@@ -92,6 +92,22 @@ def test_matches_beside_keypoints_of_the_map_say_nothing(localizer: Localizer) -
 def test_matches_that_mean_nothing_are_refused(
     localizer: Localizer, wrong: NDArray[np.float64]
 ) -> None:
+    name = localizer.map.images[1].name
+    with pytest.raises(InvalidInput, match="a row of the") as caught:
+        asked(localizer, {name: wrong})
+    assert (caught.value.code, caught.value.field) == (
+        "features.matches",
+        f"features.matches.{name}",
+    )
+
+
+def test_matches_with_photos_that_the_map_lacks_are_refused_by_name(localizer: Localizer) -> None:
+    opened = localizer.map
+    known = {opened.images[1].name: shared(opened, 0, 1)}
+    unknown = {f"left/{number}.jpgg": shared(opened, 0, 1) for number in range(5)}
     with pytest.raises(InvalidInput) as caught:
-        asked(localizer, {"a.jpg": wrong})
-    assert (caught.value.code, caught.value.field) == ("features.matches", "features.matches.a.jpg")
+        asked(localizer, known | unknown)
+    error = caught.value
+    assert (error.code, error.field) == ("features.matches", "features.matches.left/0.jpgg")
+    assert "left/0.jpgg, left/1.jpgg, left/2.jpgg and 2 more" in str(error.got)
+    assert opened.images[1].name not in str(error.got)
