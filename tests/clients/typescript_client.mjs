@@ -2,11 +2,7 @@
 // line of JSON, and {"localized": ..., ...} goes out.
 import { readFile } from "node:fs/promises";
 import { text } from "node:stream/consumers";
-import {
-  cameraMatrix,
-  connect,
-  sessionFromMap,
-} from "../../web/client/dist/index.js";
+import { cameraMatrix, connect, sessionFromMap } from "../../web/client/dist/index.js";
 
 const given = JSON.parse(await text(process.stdin));
 const client = connect(given.url, { timeoutSeconds: 60 });
@@ -35,10 +31,10 @@ const rig = await client.localizeRig({
   })),
 });
 // Each photo alone, a second apart, and one between the first two that shows nothing.
-const single = (photo) => [{ image: new Uint8Array(photo), camera }];
-const walk = photos
-  .slice(0, 2)
-  .map((photo, i) => ({ timestamp: 2 * i, images: single(photo) }));
+const single = (photo, i) => [
+  { image: new Uint8Array(photo), camera: given.rig.sensors[`cam${i}`].camera },
+];
+const walk = photos.slice(0, 2).map((photo, i) => ({ timestamp: 2 * i, images: single(photo, i) }));
 const gap = { timestamp: 1, images: [{ image: new Blob([]), camera }] };
 const sequence = [];
 const instants = [walk[0], gap, walk[1]];
@@ -47,7 +43,6 @@ const asked = {
   instants,
   time_unit: "s",
   max_gap_s: 5,
-  options: { top_k: 4 },
 };
 for await (const each of client.localizeSequence(asked)) sequence.push(each);
 
@@ -55,10 +50,7 @@ for await (const each of client.localizeSequence(asked)) sequence.push(each);
 async function sequenceUntil(call, most = Infinity, signal = undefined) {
   const answers = [];
   try {
-    for await (const each of client.localizeSequence(
-      { map, time_unit: "s", ...call },
-      signal,
-    )) {
+    for await (const each of client.localizeSequence({ map, time_unit: "s", ...call }, signal)) {
       answers.push(each.status);
       if (answers.length === most) break;
     }
@@ -85,11 +77,7 @@ process.stdout.write(
       left: await sequenceUntil({ instants }, 1),
       disordered: await sequenceUntil({ instants: [walk[1], walk[0]] }),
       unknown: await sequenceUntil({ map: "nowhere", instants }),
-      aborted: await sequenceUntil(
-        { instants },
-        9,
-        AbortSignal.abort(new Error("given up")),
-      ),
+      aborted: await sequenceUntil({ instants }, 9, AbortSignal.abort(new Error("given up"))),
       photo: await sequenceUntil({
         max_gap_s: 0,
         instants: [walk[0], { timestamp: 1, images: bad }],
@@ -112,12 +100,8 @@ process.stdout.write(
           camera: { ...camera, params: [1] },
         }),
       ),
-      photo: await refusal(
-        client.localize({ map, image: new Blob(["no photo"]) }),
-      ),
-      aborted: await client
-        .maps(aborted.signal)
-        .catch((error) => error.message),
+      photo: await refusal(client.localize({ map, image: new Blob(["no photo"]) })),
+      aborted: await client.maps(aborted.signal).catch((error) => error.message),
       elsewhere: await refusal(connect("http://127.0.0.1:9").maps()),
     },
   }),
