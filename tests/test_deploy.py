@@ -8,6 +8,7 @@ import ssl
 import subprocess
 import sys
 import threading
+import time
 import tomllib
 import zipfile
 from collections.abc import Iterator
@@ -24,6 +25,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
 from service.settings import ServiceSettings, read_settings
+from tests.serving import ENVIRONMENT, READY
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -365,6 +367,68 @@ def test_a_wheel_carries_the_built_page_and_the_report_and_nothing_else_of_web(
     assert any(name.startswith("visloc_web/built/page/assets/") for name in files)
     assert {name for name in carried if name.startswith("visloc_web/built/")} == files
     assert not any("node_modules" in name or name.startswith("web/") for name in carried)
+
+
+@pytest.mark.slow
+def test_a_wheel_makes_a_map_and_serves_it_without_the_sources(tmp_path: Path) -> None:
+    built, there, work = tmp_path / "dist", tmp_path / "there", tmp_path / "work"
+    work.mkdir()
+    offline = ("--no-deps", "--no-index", "--disable-pip-version-check", "--quiet")
+    pip = (sys.executable, "-m", "pip")
+
+    def run(*command: str) -> str:
+        done = subprocess.run(
+            command,
+            cwd=work,
+            env=ENVIRONMENT | {"PYTHONPATH": str(there), "COLUMNS": "200"},
+            capture_output=True,
+            text=True,
+            timeout=300,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    run(*pip, "wheel", *offline, "--no-build-isolation", "--wheel-dir", str(built), str(ROOT))
+    (wheel,) = built.glob("visloc-*.whl")
+    run(*pip, "install", *offline, "--target", str(there), str(wheel))
+    packages = PROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"]
+    files = f"import {', '.join(packages)}; print(*({'.__file__, '.join(packages)}.__file__,))"
+    found = run(sys.executable, "-c", files).split()
+    assert len(found) == len(packages)
+    assert all(Path(file).is_relative_to(there) for file in found)
+
+    script = {name: str(there / "bin" / name) for name in PROJECT["project"]["scripts"]}
+    for command in script.values():
+        assert "Usage" in run(command, "--help").title()
+    run(script["mapping"], "sample", "room", "--images", "10", "--size", "320x240")
+    features = ("--local-features", "sift", "--workers", "2")
+    run(script["mapping"], "build", "room/mapping", "--map", "room", *features)
+    photo = next((work / "room" / "query").rglob("*.jpg"))
+    log = tmp_path / "log"
+    ports = ("--http-port=0", "--grpc-port=0", "--workers=1", "--maps-dir=maps")
+    with (
+        log.open("wb") as stderr,
+        subprocess.Popen(
+            [script["visloc-service"], *ports],
+            cwd=work,
+            env=ENVIRONMENT | {"PYTHONPATH": str(there)},
+            stderr=stderr,
+        ) as process,
+    ):
+        try:
+            deadline = time.monotonic() + 120
+            while (ready := READY.search(log.read_text())) is None:
+                assert process.poll() is None, log.read_text()
+                assert time.monotonic() < deadline, log.read_text()
+                time.sleep(0.1)
+            answer = run(
+                *(script["localize"], "image", str(photo), "--map", "room", "--server", ready[1])
+            )
+        finally:
+            process.kill()
+    assert "localized" in answer
+    assert "position" in answer
 
 
 # Healthcheck

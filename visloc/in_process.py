@@ -31,7 +31,7 @@ from visloc.localization.solving import Look, SeenImage
 from visloc.options import LocalizeOptions
 from visloc.photo_formats import SUFFIXES
 from visloc.priors import NO_PRIORS, Priors
-from visloc.types import Answer, Localized, NotLocalized
+from visloc.types import Answer, Localized, NotLocalized, Refusal
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -76,6 +76,19 @@ class PhotoResult:
         return self.answer.cam_from_world if isinstance(self.answer, Localized) else None
 
     @property
+    def localized(self) -> bool:
+        """Whether there is a pose; False with a coarse one only."""
+        return self.pose is not None
+
+    @property
+    def refusal(self) -> Refusal | None:
+        """Why there is no pose; None where there is one, or where ``error`` tells why."""
+        answer = self.answer
+        if not isinstance(answer, NotLocalized):
+            return None
+        return Refusal(answer.stage, answer.reason, answer.message, answer.candidates)
+
+    @property
     def pose_error(self) -> tuple[float, float] | None:
         """Metres and degrees to the true pose; None when one of the two is missing."""
         pose, truth = self.pose, self.truth
@@ -112,7 +125,7 @@ class PhotoResult:
     def _reason(self) -> str | None:
         if self.error is not None:
             return self.error.code
-        return self.answer.reason.value if isinstance(self.answer, NotLocalized) else None
+        return None if self.refusal is None else self.refusal.reason.value
 
     def look_again(self) -> tuple[Photo, Look, NDArray[np.bool_]]:
         """Match the photo once more, for figures: a result keeps neither pixels nor matches.

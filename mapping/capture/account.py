@@ -11,6 +11,7 @@ import numpy as np
 from mapping.capture.frames import FilmedVideo
 from mapping.capture.job import Captured
 from mapping.capture.trying import Trials
+from mapping.report.cameras import disputed_focal_lengths
 from visloc.archive import Map
 
 USED, NOT_CONNECTED, BLURRED = "used", "not connected", "too blurred"
@@ -19,6 +20,8 @@ _STILL = 0.02  # longer sides of the picture in a second
 _GOOD, _USABLE = 0.9, 0.7
 # With fewer of the photos in it, a map is poor; with fewer than the second share, it is not good.
 _LEAST_IN_MAP, _MOST_IN_MAP = 0.5, 0.75
+# Share by which photos and EXIF may differ about a focal length unsaid: makers round theirs.
+_FOCAL_OFF = 0.05
 # Names that a line lists.
 _NAMED = 3
 # Photos in a row that are not found, and show a weak spot of a good map.
@@ -117,9 +120,21 @@ def verdict(trials: Trials, captured: Captured, opened: Map) -> str:
         f"beside them had not been taken: {int(trials.right.sum())} were found where they were "
         "taken.",
         size,
+        *_focal_lengths(opened),
         *(f"What speaks against it: {doubt.message}." for doubt in doubts),
     ]
     return " ".join(lines)
+
+
+def _focal_lengths(opened: Map) -> list[str]:
+    """Say what the own test cannot see: photos of one wrong focal length agree with each other."""
+    return [
+        f"Distances from the cameras to what they see may be {abs(found / used - 1):.0%} off: the "
+        f"map uses a focal length of {used:.0f} px, the photos fit {found:.0f} px best, and do not "
+        "tell which is right."
+        for used, found in disputed_focal_lengths(opened)
+        if abs(found / used - 1) > _FOCAL_OFF
+    ]
 
 
 def film_again(trials: Trials, stretches: Sequence[Stretch], opened: Map) -> list[str]:

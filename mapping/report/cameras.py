@@ -78,6 +78,21 @@ def cameras_of(opened: Map) -> dict[str, MapCamera]:
     return cameras
 
 
+def disputed_focal_lengths(opened: Map) -> list[tuple[float, float]]:
+    """Return focal lengths (px) that were kept as known, each with the one that photos fit best.
+
+    Only those that the photos do not determine.
+    """
+    settings = opened.manifest.method.settings
+    origins = (_origin(settings, name) for name in opened.cameras)
+    return [
+        (origin.prior_px, origin.refined_px)
+        for origin in origins
+        if origin is not None and origin.doubt == "undetermined"
+        if origin.prior_px is not None and origin.refined_px is not None
+    ]
+
+
 def origins_record(a: Map, b: Map, images: Sequence[ImageRecord]) -> dict[str, JsonValue]:
     """Return what the manifest of a joined map says of its cameras.
 

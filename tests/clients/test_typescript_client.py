@@ -94,6 +94,34 @@ def test_a_rig_is_localized(seen: dict[str, Any], queries: list[Any]) -> None:
     assert [image["sensor"] for image in rig["images"]] == [f"cam{i}" for i in range(len(queries))]
 
 
+def test_the_instants_of_a_sequence_are_localized_and_the_gap_is_filled(
+    seen: dict[str, Any], queries: list[Any]
+) -> None:
+    first, gap, last = seen["sequence"]
+    assert [each["timestamp"] for each in (first, gap, last)] == [0, 1, 2]
+    sources = [each["source"] for each in (first, gap, last)]
+    assert sources == ["estimated", "interpolated", "estimated"]
+    for each, query in zip((first, last), queries[:2], strict=True):
+        sent = each["pose"]["rig_from_world"]
+        pose = Pose.from_quaternion(sent["rotation_wxyz"], sent["translation"])
+        metres, degrees = pose_error(pose, query.cam_from_world)
+        assert metres < 0.01
+        assert degrees < 0.1
+
+
+def test_a_sequence_ends_where_its_caller_leaves_or_with_its_error(seen: dict[str, Any]) -> None:
+    sequences = seen["sequences"]
+    assert sequences["left"] == {"answers": ["localized"]}
+    assert sequences["photo"] == {"answers": ["localized", "not_localized"]}  # it is no photo
+    assert sequences["aborted"] == {"answers": [], "message": "given up"}
+    for name, code, field in (
+        ("disordered", "sequence.timestamps", "instants[1].timestamp"),
+        ("unknown", "map.unknown", "map"),
+    ):
+        assert sequences[name]["answers"] == []
+        assert (sequences[name]["code"], sequences[name]["field"]) == (code, field)
+
+
 def test_the_map_and_its_landmarks_are_read(seen: dict[str, Any]) -> None:
     assert seen["maps"] == {"listed": "room", "asked": seen["points"]["total"]}
     assert seen["points"]["count"] == 100

@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 
 from mapping.cli.report import write_report
+from mapping.frames.georeference import given_place, publish_anchored
 from tests.serving import ENVIRONMENT, serving
 from visloc.archive import MapStore
 from visloc.evaluation import pose_error
@@ -292,6 +293,57 @@ def test_names_are_text_whatever_they_hold(browser: Browser, query: Query) -> No
     for name, shown in zip(names, seen["shown"], strict=True):
         assert name.split("\n")[-1] in shown
         assert markup in shown
+
+
+# Link
+
+
+@pytest.fixture(scope="module")
+def on_earth(built_maps: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The map ``room`` with a place on Earth, its x axis pointing north, is served."""
+    folder = tmp_path_factory.mktemp("on_earth")
+    maps = Path(shutil.copytree(built_maps, folder / "maps"))
+    room = MapStore(maps).open("room")
+    place = given_place(
+        room, (45.2178, 5.8083, 310.0), 90.0, accuracy=0.1, gravity=(0.0, 0.0, -1.0)
+    )
+    publish_anchored(room, place, maps, force=False)
+    with serving(maps, folder / "log") as url:
+        yield url
+
+
+def test_a_pose_is_shared_by_a_link_and_says_where_on_earth_it_is(
+    browser: Browser, on_earth: str, queries: list[Query]
+) -> None:
+    first, second = filmed(queries)
+    seen = browser.see(
+        "link",
+        url=on_earth,
+        camera=camera_text(first.camera),
+        photo={"path": str(first.path), "name": "first.jpg", "way": "dropped"},
+        other={"path": str(second.path), "name": "second.jpg", "way": "dropped"},
+    )
+
+    assert_is_quiet(seen)
+    answer, opened = seen["answer"], seen["opened"]
+    at = answer["geopose"]["position"]
+    assert abs(at["lat"] - 45.2178) < 1e-4
+    ahead = first.cam_from_world.rotation[2]  # of the camera, in the world
+    heading = np.degrees(np.arctan2(-ahead[1], ahead[0])) % 360  # x is north, y west
+    for text in (seen["shown"], opened["shown"]):
+        assert f"{at['lat']:.7f}, {at['lon']:.7f}" in text
+        found = re.search(r"Heading\s+(\d+)°", text)
+        assert found is not None
+        assert abs((int(found[1]) - heading + 180) % 360 - 180) < 1.5
+    # The link shows the same pose from the same side, in this version of the map.
+    assert opened["address"] == seen["link"]
+    assert opened["map"]["version"] == answer["map"]["version"]
+    assert f"{answer['pose']['position'][0]:.3f}" in opened["shown"]
+    assert "the camera of the last answer" in opened["described"]
+    for name, there in seen["view"].items():
+        assert opened["view"][name] == pytest.approx(there, abs=1e-4)
+    assert "first.jpg" not in seen["link"]
+    assert seen["left"] == f"{on_earth}/#map=room"
 
 
 # Key

@@ -34,6 +34,8 @@ def test_a_photo_is_answered_as_by_the_localizer(room: LocalMap, query: Query) -
     result = room.localize(str(query.path), query.camera)
 
     assert result.status == result.answer.status == "localized"  # type: ignore[union-attr]
+    assert result.localized
+    assert result.refusal is None
     assert result.pose is not None
     position_error = result.pose.center - query.cam_from_world.center
     assert abs(position_error).max() < 0.1
@@ -91,7 +93,11 @@ def test_a_refused_photo_has_its_reason(
     result = room.localize(photos_of_another_room[0], query.camera)
 
     assert result.status == "not_localized"
+    assert not result.localized
     assert result.pose is None
+    assert result.refusal is not None
+    assert result.refusal.reason == result.row()["reason"]
+    assert result.refusal.message
     row = result.row()
     assert row["reason"] in ("too_few_matches", "no_pose", "too_few_inliers", "low_inlier_ratio")
     assert row["x"] is row["position_std"] is None

@@ -6,6 +6,7 @@ import {
   ServiceError,
   type Features,
   type LocalizeCall,
+  type SequenceCall,
 } from "visloc-client";
 
 const BASE = new URL("https://maps.example.org/visloc/");
@@ -182,6 +183,78 @@ describe("the form of a rig", () => {
     expect(request).toMatchObject({ map: "kitchen@7", rig: "rig" });
     expect(await (form.get("image0") as File).text()).toBe("left");
     expect(await (form.get("image1") as File).text()).toBe("mask");
+  });
+});
+
+describe("a sequence", () => {
+  const instant = { status: "localized", images: [], map: {}, seconds: {} };
+  const CALL: SequenceCall = {
+    map: "kitchen",
+    instants: [0, 1].map((timestamp) => ({ timestamp, images: [] })),
+  };
+
+  /** Answer with these pieces of NDJSON. */
+  function saying(...pieces: string[]): Request[] {
+    const headers = { "Content-Type": "application/x-ndjson" };
+    return answering(() => {
+      const bytes = pieces.map((piece) => new TextEncoder().encode(piece));
+      return new Response(new Blob(bytes).stream(), { headers });
+    });
+  }
+
+  async function answers(given = CALL): Promise<{ came: string[]; error: ServiceError | null }> {
+    const came: string[] = [];
+    try {
+      for await (const each of connect(BASE).localizeSequence(given)) came.push(each.status);
+    } catch (error) {
+      return { came, error: error as ServiceError };
+    }
+    return { came, error: null };
+  }
+
+  const line = JSON.stringify(instant) + "\n";
+
+  test("is posted as a form, and its answers are lines", async () => {
+    const asked = saying(line.slice(0, 7), line.slice(7) + line);
+    const images = [{ image: new Blob(["a"]) }];
+    const instants = [0, 1].map((timestamp) => ({ timestamp, images }));
+    expect(await answers({ ...CALL, instants })).toEqual({
+      came: ["localized", "localized"],
+      error: null,
+    });
+    expect(asked[0]!.headers.get("Accept")).toBe("application/x-ndjson");
+    const form = await asked[0]!.formData();
+    expect([...form.keys()].sort()).toEqual(["image0", "image1", "request"]);
+    expect(JSON.parse(String(form.get("request")))).toEqual({
+      map: "kitchen",
+      instants: [0, 1].map((timestamp) => ({ timestamp, images: [{ part: `image${timestamp}` }] })),
+    });
+  });
+
+  test("may end with an error, after the answers before it", async () => {
+    const problem = { status: 400, code: "priors.maps", detail: "no such tile", field: "priors" };
+    saying(line + JSON.stringify({ problem }) + "\n");
+    const { came, error } = await answers();
+    expect(came).toEqual(["localized"]);
+    expect(error).toMatchObject({ code: "priors.maps", field: "priors", message: "no such tile" });
+    expect(error!.problem.status).toBe(400);
+  });
+
+  test.each([
+    ["half a line", line + line.slice(0, 9)],
+    ["fewer answers than instants", line],
+    ["a line that is no answer", line + "{}\n"],
+    ["a line that is not JSON", line + "<html>\n"],
+  ])("is no answer of the service: %s", async (_, body) => {
+    saying(body);
+    const { came, error } = await answers();
+    expect(came).toEqual(["localized"]);
+    expect(error!.code).toBe("server.answer");
+  });
+
+  test("is no answer of the service where something else answers", async () => {
+    answering(() => json({ hello: "world" }));
+    expect((await answers()).error!.code).toBe("server.answer");
   });
 });
 

@@ -17,6 +17,7 @@ from mapping.capture.motion import Motion
 from mapping.capture.picture import draw_walk
 from mapping.capture.trying import Trials, try_photos
 from mapping.capture.video import VideoFacts
+from mapping.methods.sparse.intrinsics import CAMERAS, CameraOrigin, Reason
 
 
 class _Image:
@@ -30,6 +31,7 @@ class _Opened:
     def __init__(self, names: list[str], map_id: str = "room") -> None:
         self.images = [_Image(name) for name in names]
         self.manifest = SimpleNamespace(id=map_id)
+        self.cameras: dict[str, None] = {}
 
 
 def captured() -> Captured:
@@ -140,15 +142,42 @@ def test_a_map_of_the_sample_is_judged_and_drawn(build_sample: Any, tmp_path: Pa
         assert (picture[:1000] == colour).all(axis=2).sum() > 100
 
 
+def _manifest(**cameras: CameraOrigin) -> SimpleNamespace:
+    settings = {CAMERAS: {name: origin.model_dump() for name, origin in cameras.items()}}
+    return SimpleNamespace(
+        world=SimpleNamespace(metric=False),
+        parts=SimpleNamespace(doubts=()),
+        method=SimpleNamespace(settings=settings),
+    )
+
+
+@pytest.mark.parametrize(
+    ("doubt", "refined", "said"),
+    [("undetermined", 570.5, True), ("undetermined", 430.0, False), (None, 570.5, False)],
+)
+def test_a_focal_length_that_the_photos_dispute_is_told(
+    doubt: Reason | None, refined: float, said: bool
+) -> None:
+    opened: Any = _Opened(["a.jpg"])
+    opened.cameras = {"drone": None}
+    opened.manifest = _manifest(
+        drone=CameraOrigin(source="exif", prior_px=424.3, doubt=doubt, refined_px=refined)
+    )
+    trials = Trials(np.arange(1), np.ones(1, np.bool_))
+    text = verdict(trials, Captured(Path("map"), {}, ["a.jpg"], (), Path()), opened)
+    assert (
+        "may be 34% off: the map uses a focal length of 424 px, the photos fit 570 px" in text
+    ) is said
+    assert ("focal length" in text) is said
+
+
 @pytest.mark.parametrize(
     ("placed", "grade"), [(1, "poor"), (2, "usable"), (3, "good"), (4, "good")]
 )
 def test_a_map_that_lost_photos_is_not_good(placed: int, grade: str) -> None:
     names = ["a.jpg", "b.jpg", "c.jpg", "d.jpg"]
     opened: Any = _Opened(names[:placed])
-    opened.manifest = SimpleNamespace(
-        world=SimpleNamespace(metric=False), parts=SimpleNamespace(doubts=())
-    )
+    opened.manifest = _manifest()
     trials = Trials(np.arange(placed), np.ones(placed, np.bool_))
     text = verdict(trials, Captured(Path("map"), {}, names, (), Path()), opened)
     assert f"The map is {grade}: {placed} of 4 photos" in text

@@ -2,14 +2,24 @@
 //
 // What the service answers is taken for what it says it is; what is no answer of the service, such
 // as a proxy's page, is told apart here, so that callers meet one kind of error: ServiceError.
-import { noAnswer, ownError, serviceError, type ServiceError } from "./errors.js";
+import { lineError, noAnswer, ownError, serviceError, type ServiceError } from "./errors.js";
+import { lines } from "./lines.js";
 import { parsePoints, PointsError, type PointBlock } from "./points.js";
-import { localizeForm, rigForm, type LocalizeCall, type RigCall } from "./requests.js";
+import {
+  localizeForm,
+  rigForm,
+  sequenceForm,
+  type LocalizeCall,
+  type RigCall,
+  type SequenceCall,
+} from "./requests.js";
 import type { LocalizeResponse, MapImages, MapInfo, OptionSchema, RigResponse } from "./words.js";
 
 /** Before a request is sent a second time, to another server behind the same address. */
 const RESEND_PAUSE_MS = 100;
 const DEFAULT_TIMEOUT_S = 60;
+const NDJSON = "application/x-ndjson";
+const RIG_MEMBERS = ["status", "images", "map", "seconds"] as const;
 
 export interface Settings {
   /** A function is asked before each request; null for none. */
@@ -24,6 +34,12 @@ export interface Client {
   localize(call: LocalizeCall, signal?: AbortSignal): Promise<LocalizeResponse>;
   /** Say where several cameras that move together are, from their photos of one instant. */
   localizeRig(call: RigCall, signal?: AbortSignal): Promise<RigResponse>;
+  /**
+   * Say where a camera or a rig was at the instants of a walk, one answer for each, in their order:
+   * `for await (const answer of client.localizeSequence(call))`. An answer comes as soon as no later
+   * instant can change it. The time limit is for each answer. Leaving the loop ends the work.
+   */
+  localizeSequence(call: SequenceCall, signal?: AbortSignal): AsyncGenerator<RigResponse, void>;
   maps(signal?: AbortSignal): Promise<MapInfo[]>;
   /** Describe one map: an id or `id@version`. */
   map(ref: string, signal?: AbortSignal): Promise<MapInfo>;
@@ -62,6 +78,7 @@ export function connect(server: string | URL, settings: Settings = {}): Client {
     // A balancer sends the requests of a map to the server that has it open.
     if (request.map !== undefined) headers.set("X-Visloc-Map", request.map.split("@")[0] ?? "");
     if (timeoutSeconds !== null) headers.set("X-Request-Timeout", String(timeoutSeconds));
+    if (request.accept !== undefined) headers.set("Accept", request.accept);
     const form = request.form?.();
     try {
       return await fetch(new URL(path, base), {
@@ -86,7 +103,8 @@ export function connect(server: string | URL, settings: Settings = {}): Client {
   }
 
   function brokenOff(error: unknown, request: Asking, code: string, detail: string): ServiceError {
-    if (request.limit?.aborted !== true) return noAnswer(code, detail, String(error));
+    const late = request.timedOut ?? request.limit;
+    if (late?.aborted !== true) return noAnswer(code, detail, String(error));
     const seconds = `${timeoutSeconds} s`;
     return ownError("server.timeout", "No answer", "the service did not answer in time", {
       expected: `an answer within ${seconds}`,
@@ -97,16 +115,65 @@ export function connect(server: string | URL, settings: Settings = {}): Client {
   async function readJson<Answer>(
     path: string,
     what: string,
-    members: (keyof Answer)[],
+    members: readonly (keyof Answer)[],
     request: Asking,
   ): Promise<Answer> {
     const response = await ask(path, request);
     const answer = await whole(request, () => response.json() as Promise<Answer | null>);
-    const known = typeof answer === "object" && answer !== null;
-    if (!known || members.some((member) => answer[member] == null)) {
-      throw noAnswer("server.answer", `this is not ${what}`, JSON.stringify(answer));
+    return checked(answer, what, members);
+  }
+
+  /** Ask for one answer to each instant, and pass each on when it comes. */
+  async function* sequence(
+    call: SequenceCall,
+    signal: AbortSignal | undefined,
+  ): AsyncGenerator<RigResponse, void> {
+    const patience = new AbortController();
+    const ended = new AbortController();
+    let clock: ReturnType<typeof setTimeout> | undefined;
+    /** Wait for the next answer as long as for another one; the caller may take its time. */
+    async function inTime<Next>(wait: () => Promise<Next>): Promise<Next> {
+      if (timeoutSeconds !== null) {
+        clock = setTimeout(() => patience.abort(), 1000 * timeoutSeconds);
+      }
+      try {
+        return await wait();
+      } finally {
+        clearTimeout(clock);
+      }
     }
-    return answer;
+    const given = signal === undefined ? [] : [signal];
+    const request: Asking = {
+      map: call.map,
+      form: () => sequenceForm(call),
+      accept: NDJSON,
+      signal: signal ?? null,
+      limit: AbortSignal.any([...given, patience.signal, ended.signal]),
+      timedOut: patience.signal,
+    };
+    let answers = 0;
+    try {
+      const response = await inTime(() => ask("localize/sequence", request));
+      if (!(response.headers.get("Content-Type") ?? "").startsWith(NDJSON)) {
+        const kind = response.headers.get("Content-Type") ?? "nothing";
+        throw noAnswer("server.answer", "the answer is not one of the service", kind);
+      }
+      const come = lines(response);
+      for (;;) {
+        const next = await inTime(() => whole(request, () => come.next()));
+        if (next.done === true) break;
+        const said = await whole(request, async () => JSON.parse(next.value) as RigOrProblem);
+        if (said?.problem != null) throw lineError(said.problem, response);
+        yield checked<RigResponse>(said, "the answer to an instant", RIG_MEMBERS);
+        answers += 1;
+      }
+    } finally {
+      ended.abort(); // whoever leaves the loop wants no more of it
+    }
+    if (answers !== call.instants.length) {
+      const got = `${answers} answers to ${call.instants.length} instants`;
+      throw noAnswer("server.answer", "the answer breaks off", got);
+    }
   }
 
   function asking(
@@ -133,9 +200,10 @@ export function connect(server: string | URL, settings: Settings = {}): Client {
       readJson(
         "localize/rig",
         "the answer to the photos of a rig",
-        ["status", "images", "map", "seconds"],
+        RIG_MEMBERS,
         asking(signal, { map: call.map, form: () => rigForm(call) }),
       ),
+    localizeSequence: sequence,
     async maps(signal) {
       type Listed = { maps: MapInfo[] };
       return (await readJson<Listed>("maps", "the list of maps", ["maps"], asking(signal))).maps;
@@ -185,6 +253,24 @@ interface Asking {
   signal: AbortSignal | null;
   /** The caller's, and the time that is left. */
   limit: AbortSignal | null;
+  /** Where `limit` may also end for another reason: aborted when the time is over. */
+  timedOut?: AbortSignal;
+  accept?: string;
+}
+
+type RigOrProblem = (RigResponse & { problem?: Record<string, unknown> }) | null;
+
+/** An answer that has `members`, those that everything else is read after. */
+function checked<Answer>(
+  answer: Answer | null,
+  what: string,
+  members: readonly (keyof Answer)[],
+): Answer {
+  const known = typeof answer === "object" && answer !== null;
+  if (!known || members.some((member) => answer[member] == null)) {
+    throw noAnswer("server.answer", `this is not ${what}`, JSON.stringify(answer));
+  }
+  return answer;
 }
 
 function mayResend({ problem }: ServiceError): boolean {

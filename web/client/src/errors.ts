@@ -64,15 +64,21 @@ export async function serviceError(response: Response): Promise<ServiceError> {
   // A service that says "at once" is not to be flooded, and timers hold no more than some weeks.
   const seconds = Number.isFinite(retryAfter) ? Math.min(Math.max(retryAfter, 0.5), 3600) : null;
   const said: unknown = await response.json().catch(() => null);
-  return new ServiceError(problemOf(said, response), seconds);
+  return new ServiceError(problemOf(said, response, response.status), seconds);
 }
 
-function problemOf(said: unknown, response: Response): Problem {
+/** The error that the last line of an answer in lines tells, under status 200. */
+export function lineError(said: Record<string, unknown>, response: Response): ServiceError {
+  const status = typeof said["status"] === "number" ? said["status"] : 500;
+  return new ServiceError(problemOf(said, response, status));
+}
+
+function problemOf(said: unknown, response: Response, status: number): Problem {
   const words = (typeof said === "object" && said !== null ? said : {}) as Record<string, unknown>;
   const text = (name: string): string | null => (words[name] == null ? null : String(words[name]));
   return {
     title: text("title") ?? response.statusText,
-    status: response.status,
+    status,
     detail: text("detail") ?? "something other than the service answered, such as a proxy",
     code: text("code") ?? "server.answer",
     field: text("field"),

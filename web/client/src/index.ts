@@ -19,5 +19,7 @@ export {
   type Priors,
   type RigCall,
   type RigImage,
+  type SequenceCall,
+  type SequenceInstant,
 } from "./requests.js";
 export * from "./words.js";

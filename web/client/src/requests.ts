@@ -86,6 +86,29 @@ export interface RigCall extends Where {
   images: RigImage[];
 }
 
+/** One instant of a sequence. */
+export interface SequenceInstant {
+  /** A whole number, greater than that of the instant before. */
+  timestamp: number;
+  /** None where there is only odometry. `sensor` may be left out where the call has no `rig`. */
+  images: (Omit<RigImage, "sensor"> & { sensor?: string })[];
+  /** The rig by a tracker, in the tracker's own world, metres: only its motion counts. */
+  odometry?: { rig_from_odometry: Transform; covariance?: number[] };
+  /** Of this instant, instead of those of the sequence. */
+  priors?: Priors;
+}
+
+export interface SequenceCall extends Where {
+  /** As of a rig; left out, the sequence is of one camera. */
+  rig?: RigCall["rig"];
+  /** In the order of time. */
+  instants: SequenceInstant[];
+  /** Of the timestamps; left out, their size tells it. */
+  time_unit?: "s" | "ms" | "us" | "ns";
+  /** Longest gap between measured instants that is filled: 0 (none) to 60 seconds, by default 1. */
+  max_gap_s?: number;
+}
+
 /** The form of POST /localize. What was not chosen is not sent: the service has defaults. */
 export function localizeForm(call: LocalizeCall): FormData {
   const form = new FormData();
@@ -108,21 +131,36 @@ export function localizeForm(call: LocalizeCall): FormData {
 /** The form of POST /localize/rig: a text `request`, and a file for each photo and mask. */
 export function rigForm(call: RigCall): FormData {
   const form = new FormData();
-  let files = 0;
+  form.set("request", JSON.stringify({ ...call, images: withParts(call.images, form) }));
+  return form;
+}
+
+/** The form of POST /localize/sequence, likewise. */
+export function sequenceForm(call: SequenceCall): FormData {
+  const form = new FormData();
+  const instants = call.instants.map((instant) => ({
+    ...instant,
+    images: withParts(instant.images, form),
+  }));
+  form.set("request", JSON.stringify({ ...call, instants }));
+  return form;
+}
+
+/** Put photos and masks into a form, and name their parts instead. */
+function withParts(images: Omit<RigImage, "sensor">[], form: FormData): unknown[] {
+  let files = [...form.keys()].length;
   const part = (photo: Photo): string => {
     const name = `image${files++}`;
     form.set(name, blobOf(photo), "photo");
     return name;
   };
-  const images = call.images.map(({ image, mask, features, camera, ...rest }) => ({
+  return images.map(({ image, mask, features, camera, ...rest }) => ({
     ...rest,
     ...(image === undefined ? {} : { part: part(image) }),
     ...(mask === undefined ? {} : { mask_part: part(mask) }),
     ...(features === undefined ? {} : { features: featuresJson(features) }),
     ...(camera == null ? {} : { camera }),
   }));
-  form.set("request", JSON.stringify({ ...call, images }));
-  return form;
 }
 
 const blobOf = (photo: Photo): Blob => (photo instanceof Blob ? photo : new Blob([photo]));

@@ -28,6 +28,8 @@ export interface MapInfo {
   kind: "map" | "set";
   /** Of a set that was asked for alone. */
   tiles: Tile[];
+  /** Where the map lies on Earth: a circle around it, metres. Null when it is not anchored. */
+  place: { latitude: number; longitude: number; radius: number } | null;
 }
 
 /** One map of a set. */
@@ -93,6 +95,16 @@ export interface PoseEstimate extends Estimate {
 
 export interface RigPose extends Estimate {
   rig_from_world: Transform;
+}
+
+/**
+ * OGC GeoPose 1.0, Basic-Quaternion. The quaternion turns the body's axes (x forward, y left, z up)
+ * to east, north and up at the position.
+ */
+export interface GeoPose {
+  /** Degrees, WGS84, and metres above the ellipsoid. */
+  position: { lat: number; lon: number; h: number };
+  quaternion: { x: number; y: number; z: number; w: number };
 }
 
 /** Where the most similar mapping photos say that a refused photo was taken: `fallback=coarse`. */
@@ -161,6 +173,8 @@ export interface LocalizeResponse {
   camera: CameraUsed;
   orientation: { exif: number; read_as: string; turned: number };
   map: { id: string; version: string };
+  /** Of the camera; null when not localized, or when the map is not anchored to the Earth. */
+  geopose: GeoPose | null;
   /** Of a set: `id@version` of the map in it that the answer rests on. */
   tile: string | null;
   seconds: Record<string, number>;
@@ -183,7 +197,7 @@ export interface RigImageAnswer {
   orientation: { exif: number; read_as: string; turned: number };
 }
 
-/** The answer to the photos of a rig. */
+/** The answer to the photos of a rig, or to those of one instant of a sequence. */
 export interface RigResponse {
   request_id: string;
   timestamp: number | null;
@@ -197,6 +211,8 @@ export interface RigResponse {
   inliers: number;
   inlier_ratio: number;
   map: { id: string; version: string };
+  /** Of the rig, with the axes of its frame read like a camera's. */
+  geopose: GeoPose | null;
   tile: string | null;
   seconds: Record<string, number>;
 }

@@ -1,5 +1,11 @@
 // The answer to a photo: a pose, or how far the photo came and what to try.
-import { mapRef, type CoarsePose, type LocalizeResponse, type PoseEstimate } from "visloc-client";
+import {
+  mapRef,
+  type CoarsePose,
+  type GeoPose,
+  type LocalizeResponse,
+  type PoseEstimate,
+} from "visloc-client";
 import { button, element, facts } from "../dom";
 import { ellipsoid95, lengthText, REACH_95 } from "../geometry";
 import { copyText, textsToCopy } from "./copying";
@@ -7,10 +13,13 @@ import type { Entry } from "./photo_queue";
 import { photoPicture } from "./photo_picture";
 import { advice, outcomes, STAGES } from "./refusals";
 import { covarianceOfPosition, shownPlaces } from "./shown_pose";
+import { poseLink } from "./share";
 import { answerJson, curlLine, pythonLines, type Question } from "./snippets";
+import { headingText, positionText } from "../earth";
 import { CAMERA_SOURCES, countText, digits, positionStd, secondsText } from "../words";
 
 const IN_FOLDER = "To be run in the folder of the photo.";
+const LINK = "Opens this page at the pose. The photo is not in it.";
 
 export interface AnswerActions {
   metric: boolean;
@@ -33,6 +42,7 @@ export function answerView(
   actions: AnswerActions,
 ): HTMLElement {
   const { pose, refusal } = answer;
+  const link = poseLink(actions.question.server, answer);
   return element(
     "div",
     { class: "stack answer" },
@@ -41,6 +51,7 @@ export function answerView(
     ...candidateList(answer, actions),
     photoPicture(entry.photo, answer),
     ...(pose === null ? [] : [poseTable(pose, actions.metric)]),
+    ...earthSection(answer.geopose),
     section(
       refusal === null ? "What it rests on" : "What was found",
       facts([
@@ -65,6 +76,7 @@ export function answerView(
           { name: "JSON", text: answerJson(answer), note: "What the line of curl answers." },
           { name: "curl", text: curlLine(actions.question), note: IN_FOLDER },
           { name: "Python", text: pythonLines(actions.question), note: IN_FOLDER },
+          ...(link === null ? [] : [{ name: "Link", text: link, note: LINK }]),
         ],
         actions.announce,
       ),
@@ -190,6 +202,17 @@ function signed(value: number): string {
 
 function percent(answer: LocalizeResponse): string {
   return `${digits(100 * answer.inlier_ratio, 2)} %`;
+}
+
+/** Where on Earth, and which way; nothing of a map that is not anchored. */
+export function earthSection(geopose: GeoPose | null): HTMLElement[] {
+  if (geopose === null) return [];
+  const rows: [string, string][] = [
+    ["Latitude, longitude", positionText(geopose)],
+    ["Height", `${geopose.position.h.toFixed(2)} m above the ellipsoid`],
+    ["Heading", headingText(geopose)],
+  ];
+  return [section("On Earth", facts(rows))];
 }
 
 function poseTable(pose: PoseEstimate, metric: boolean): HTMLElement {

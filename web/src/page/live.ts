@@ -1,6 +1,7 @@
 // Live: the frames of this device's camera, localized one after the other on a walk.
 import { mapRef, type LocalizeResponse, type MapInfo } from "visloc-client";
 import { element } from "../dom";
+import { headingText, positionText } from "../earth";
 import { lengthText } from "../geometry";
 import { countText, counted } from "../words";
 import type { PageContext } from "./context";
@@ -299,7 +300,7 @@ export function createLive(host: HTMLElement, context: PageContext): Live {
 
 /** Why there is no pose, or how good it is. */
 function answerInWords(
-  { pose, refusal, inliers, correspondences }: LocalizeResponse,
+  { pose, refusal, inliers, correspondences, geopose }: LocalizeResponse,
   metric: boolean,
 ): string {
   if (pose === null) return sentence(refusal?.message ?? "no reason was given");
@@ -307,7 +308,9 @@ function answerInWords(
   const alone = pose.uncertainty === "photo only" ? " by scatter alone" : "";
   const sure = pose.probability === null ? "" : ` Right with ${pose.probability.toFixed(2)}.`;
   const agree = `${countText(inliers)} of ${countText(correspondences)} matches agree.`;
-  return `± ${std}${alone}; ${agree}${sure}`;
+  const earth =
+    geopose === null ? "" : ` On Earth ${positionText(geopose)}, heading ${headingText(geopose)}.`;
+  return `± ${std}${alone}; ${agree}${sure}${earth}`;
 }
 
 /** Of the box around the map's landmarks. */

@@ -16,16 +16,17 @@ import type { PageContext } from "./context";
 import { takePhotos } from "./intake";
 import { createKeyEntry } from "./key";
 import { createLive } from "./live";
-import { createMapChoice, type Choice } from "./map_choice";
+import { createMapChoice, hashOf, type Choice } from "./map_choice";
 import { loadMap } from "./map_loading";
 import { createMapPanel } from "./map_panel";
 import { patiently } from "./patience";
 import { createPhotoPanel } from "./photo_panel";
 import { problemView, sentence } from "./problem_view";
+import { sharedPose } from "./share";
 import { createTabs } from "./tabs";
 import { createTheme } from "./theme";
 import { withoutView } from "./without_view";
-import { counted } from "../words";
+import { counted, shortRef } from "../words";
 import "../style/tokens.css";
 import "../style/base.css";
 import "../style/page.css";
@@ -73,6 +74,9 @@ const photos = createPhotoPanel(byId("panel-photo", HTMLElement), {
   reloadMaps,
   open: () => tabs.choose("tab-photo"),
   beforeDrawing: () => live.stop("Stopped: a photo is being looked at."),
+  linkLeft() {
+    if (shownMap !== null) history.replaceState(null, "", hashOf(shortRef(shownMap)));
+  },
 });
 takePhotos(byId("drop", HTMLElement), photos.add);
 
@@ -92,6 +96,14 @@ key.onChange(() => {
   photos.keyChanged();
 });
 choice.reload();
+
+/** A link to a pose shows it. */
+function openLink(): void {
+  const pose = sharedPose(location.hash);
+  if (pose !== null) photos.showShared(pose);
+}
+addEventListener("hashchange", openLink);
+openLink();
 
 /** Where the browser cannot draw, the page does without a view. */
 function openViewer(host: HTMLElement): Viewer {
@@ -157,9 +169,11 @@ async function show(map: MapInfo): Promise<void> {
         progress.max = block.total;
         progress.value = loaded;
         mapPanel.showBlock(block, loaded);
+        if (block.first === 0) photos.mapDrawn();
       },
       onEnd: (loaded, total) => mapPanel.showEnd(loaded, total),
     });
+    photos.mapDrawn();
   } catch (error) {
     if (signal.aborted) return;
     const again = (): void => {

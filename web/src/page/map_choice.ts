@@ -1,5 +1,5 @@
 // Which map is shown: the list of them, the choice, and the address that links to it.
-import { ServiceError, type Client, type MapInfo } from "visloc-client";
+import { mapRef, ServiceError, type Client, type MapInfo } from "visloc-client";
 import { shortRef } from "../words";
 import { element } from "../dom";
 import { instantText } from "../words";
@@ -62,7 +62,10 @@ export function createMapChoice(
     }
     if (signal.aborted) return;
     chosen = choice.kind === "map" ? choice.map : null;
-    if (chosen !== null) history.replaceState(null, "", hashOf(shortRef(chosen)));
+    // A link to a pose stays as it is while its map is shown.
+    if (chosen !== null && ![shortRef(chosen), mapRef(chosen)].includes(refOfHash() ?? "")) {
+      history.replaceState(null, "", hashOf(shortRef(chosen)));
+    }
     fill();
     onChoice(choice);
   }
@@ -109,7 +112,8 @@ export function createMapChoice(
   });
   addEventListener("hashchange", () => {
     const ref = refOfHash();
-    if (ref === null || (chosen !== null && ref === shortRef(chosen))) return;
+    if (ref === null) return;
+    if (chosen !== null && [shortRef(chosen), mapRef(chosen)].includes(ref)) return;
     // While the list is still being asked for, that goes on to the choice.
     if (maps.length === 0) reload();
     else void choose(ref);
@@ -118,7 +122,7 @@ export function createMapChoice(
 }
 
 /** `#map=id` or `#map=id@version`. */
-function hashOf(ref: string): string {
+export function hashOf(ref: string): string {
   return `#map=${encodeURIComponent(ref).replaceAll("%40", "@")}`;
 }
 

@@ -171,6 +171,10 @@ function mapFacts(map: MapInfo): HTMLElement {
     const sides = size.map((side) => lengthText(side, map.metric));
     rows.push(["Extent", `${sides.join(" × ")}${map.metric ? "" : " (not metric)"}`]);
   }
+  if (map.place !== null) {
+    const { latitude, longitude } = map.place;
+    rows.push(["On Earth", `around ${latitude.toFixed(5)}, ${longitude.toFixed(5)}`]);
+  }
   rows.push(
     ...(map.method === null ? [] : [["Method", map.method] as [string, string]]),
     ["Features", [map.local_features, ...map.global_features].join(", ")],

@@ -16,6 +16,8 @@ import { jpegHeader } from "./jpeg_header";
 import { createOptionsForm } from "./options_form";
 import { createPhotoQueue, questionOf, type Entry, type Wish } from "./photo_queue";
 import { problemView } from "./problem_view";
+import type { SharedPose } from "./share";
+import { damagedLink, sharedView } from "./shared_view";
 import { shownPlaces } from "./shown_pose";
 import { countText } from "../words";
 
@@ -36,6 +38,8 @@ export interface PhotoPanelParts {
   open(): void;
   /** A photo is about to be drawn: a walk is not any more. */
   beforeDrawing(): void;
+  /** The pose of a link is not shown any more. */
+  linkLeft(): void;
 }
 
 export interface PhotoPanel {
@@ -44,6 +48,10 @@ export interface PhotoPanel {
   add(photos: { photo: Blob; name: string }[]): void;
   /** Another map is shown: what was drawn of a photo is gone. */
   mapChanged(): void;
+  /** Landmarks of the map that is shown are drawn: the view may go to a pose. */
+  mapDrawn(): void;
+  /** Show the pose of a link instead of a photo; in its map, as soon as that is shown. */
+  showShared(pose: SharedPose | "damaged"): void;
   /** Draw no photo, until somebody asks about one or chooses one. */
   undraw(): void;
   /** Another key was given: ask again what failed for the lack of one. */
@@ -77,9 +85,12 @@ export function createPhotoPanel(host: HTMLElement, parts: PhotoPanelParts): Pho
   let follow = true;
   let drawing = true;
   let drawn: ShownPose[] = [];
+  /** What a link told, while no photo is looked at. */
+  let shared: SharedPose | null = null;
+  let flyToShared = false;
 
   const queue = createPhotoQueue(parts.service, parts.hasKey, (entry) => {
-    if (entry.state === "running" && follow) selected = entry;
+    if (entry.state === "running" && follow && shared === null) selected = entry;
     fillList();
     if (entry !== selected) return;
     if (entry.answer !== null) announce(`${entry.name}: ${inShort(entry.answer)}`);
@@ -144,8 +155,33 @@ export function createPhotoPanel(host: HTMLElement, parts: PhotoPanelParts): Pho
 
   /** Photos are what the 3D view is for now. */
   function startDrawing(): void {
+    leaveShared();
     parts.beforeDrawing();
     drawing = true;
+  }
+
+  function leaveShared(): void {
+    if (shared === null) return;
+    shared = null;
+    parts.linkLeft();
+  }
+
+  /** The numbers of a link, and its pose where its map is shown. */
+  function fillShared(pose: SharedPose, fly: boolean): void {
+    const map = parts.map();
+    const here = map !== null && mapRef(map) === pose.map;
+    shown.replaceChildren(
+      sharedView(pose, {
+        metric: map?.metric ?? true,
+        chooseMap: here || map === null ? null : () => parts.chooseMap(pose.map),
+      }),
+    );
+    if (!drawing) return;
+    drawn = here ? [pose.shown] : [];
+    viewer.showPoses(drawn);
+    viewer.highlight(new Set());
+    photoView.hidden = !here;
+    if (fly) flyTo(0);
   }
 
   function again(entry: Entry): void {
@@ -157,6 +193,7 @@ export function createPhotoPanel(host: HTMLElement, parts: PhotoPanelParts): Pho
   function clear(): void {
     queue.clear();
     selected = null;
+    leaveShared();
     fillList();
     shown.replaceChildren();
     draw(null);
@@ -285,7 +322,28 @@ export function createPhotoPanel(host: HTMLElement, parts: PhotoPanelParts): Pho
     options: options.options,
     add,
     mapChanged() {
-      if (selected !== null) show(selected, false);
+      if (shared !== null) fillShared(shared, false);
+      else if (selected !== null) show(selected, false);
+    },
+    mapDrawn() {
+      if (!flyToShared || shared === null || drawn.length === 0) return;
+      flyToShared = false;
+      flyTo(0);
+    },
+    showShared(pose) {
+      parts.open();
+      startDrawing();
+      selected = null;
+      fillList();
+      if (pose === "damaged") {
+        draw(null);
+        shown.replaceChildren(damagedLink());
+        announce("This link is damaged");
+        return;
+      }
+      [shared, flyToShared] = [pose, true];
+      fillShared(pose, true);
+      announce("The pose of a link");
     },
     undraw() {
       draw(null);

@@ -18,6 +18,8 @@ export class Steering {
   private readonly still = matchMedia("(prefers-reduced-motion: reduce)");
   private flight: Flight | null = null;
   private near = 0.01;
+  /** Whether people have moved the view since it was last put somewhere. */
+  touched = false;
 
   /** `damped` to come to rest slowly; `onChange` is called when the view is about to move; `onHome` for the key that shows all. */
   constructor(
@@ -47,6 +49,7 @@ export class Steering {
 
   private readonly cancel = (): void => {
     this.flight = null;
+    this.touched = true;
   };
 
   /** Where the view may go: about a sphere of the scene. */
@@ -59,6 +62,7 @@ export class Steering {
   /** Move the view; at once where people wish no motion, or `jump`. */
   go(position: Vector, target: Vector, jump = false): void {
     this.flight = null;
+    this.touched = false;
     if (jump || this.still.matches) {
       this.place(position, target);
     } else {
@@ -121,6 +125,7 @@ export class Steering {
     around.radius = Math.min(Math.max(around.radius, minDistance), maxDistance);
     around.makeSafe();
     this.go(new Vector().setFromSpherical(around).add(this.target), this.target.clone(), true);
+    this.touched = true;
   };
 
   dispose(): void {

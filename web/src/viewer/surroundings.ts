@@ -13,13 +13,16 @@ import {
   Vector3 as Vector,
 } from "three";
 import type { Vector3 } from "visloc-client";
-import { medianSpacing, niceLength, subtract } from "../geometry";
+import { medianSpacing, niceLength, percentile, subtract } from "../geometry";
 import { boldLines, thinLines } from "./lines";
 import { probabilityColour, type Palette } from "./themes";
 import type { CoverageArrow } from "./types";
 
 // Room around the map where it fills the picture.
 const MARGIN = 1.1;
+// The share of the landmarks at either end that does not say how large a map is: the rest is
+// stretched as if they went on evenly, so that a few landmarks far away do not make the map small.
+const OUTSIDE = 0.07;
 
 /** What the map takes up in the scene, up being +y, without its few outermost landmarks. */
 export interface Extent {
@@ -28,6 +31,27 @@ export interface Extent {
   centre: Vector;
   /** Half the diagonal. */
   radius: number;
+}
+
+/** What landmarks take up without the outermost, and all cameras. One of both may be empty. */
+export function extentOf(landmarks: Vector[], cameras: Vector[]): Extent {
+  const [min, max] = [new Vector(), new Vector()];
+  for (const axis of ["x", "y", "z"] as const) {
+    let [start, end] = [Infinity, -Infinity];
+    if (landmarks.length > 0) {
+      const along = landmarks.map((place) => place[axis]);
+      const [low, high] = [percentile(along, OUTSIDE), percentile(along, 1 - OUTSIDE)];
+      const rest = ((high - low) * OUTSIDE) / (1 - 2 * OUTSIDE);
+      [start, end] = [low - rest, high + rest];
+    }
+    for (const place of cameras) {
+      start = Math.min(start, place[axis]);
+      end = Math.max(end, place[axis]);
+    }
+    [min[axis], max[axis]] = [start, end];
+  }
+  const radius = min.distanceTo(max) / 2 || 1; // of a single place, one unit around it
+  return { min, max, radius, centre: min.clone().add(max).multiplyScalar(0.5) };
 }
 
 /** From where the whole map fills the picture of a camera that looks against `direction`. */

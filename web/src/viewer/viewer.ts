@@ -2,7 +2,7 @@
 import { Group, Scene, Vector3 as Vector } from "three";
 import type { Camera, MapImage, Vector3 } from "visloc-client";
 import { element } from "../dom";
-import { add, medianSpacing, percentile, scale, subtract, viewingDirection } from "../geometry";
+import { add, medianSpacing, scale, subtract, viewingDirection } from "../geometry";
 import { counted } from "../words";
 import { Cloud } from "./cloud";
 import { openGraphics } from "./graphics";
@@ -14,6 +14,7 @@ import { PoseMarks } from "./pose";
 import { Steering } from "./steering";
 import {
   coverageArrows,
+  extentOf,
   groundGrid,
   sceneFromWorld,
   trailLine,
@@ -26,9 +27,6 @@ import "./viewer.css";
 
 // Landmarks that say how large the map is; the first are spread evenly.
 const EXTENT_SAMPLE = 5000;
-// The share of them at either end that does not: the rest is stretched as if they went on evenly,
-// so that a few landmarks far away do not make the map small.
-const OUTSIDE = 0.07;
 // In a picture while the view rests: where the processor draws, it does so after a moment only, as
 // moves come less often than pictures would.
 const QUIET_MS = 150;
@@ -66,6 +64,8 @@ export const createViewer: CreateViewer = (host: HTMLElement, theme: Theme): Vie
   let trailObject: Group | null = null;
   let coverageObject: Group | null = null;
   let extent: Extent | null = null;
+  /** Whether the view is that of the whole map, as far as the program moved it. */
+  let framing = true;
   let size = { width: 1, height: 1 };
   let pixelRatio = 1;
   let firstPictureMs: number | null = null;
@@ -125,27 +125,22 @@ export const createViewer: CreateViewer = (host: HTMLElement, theme: Theme): Vie
     else if (drawnBefore && firstPictureMs === null) request();
   }
 
-  /** How large the map is, of the first landmarks, or of the cameras where there are none. */
+  /**
+   * How large the map is: what the first landmarks take up without the outermost, and all cameras.
+   * The view shows all of it until it is moved.
+   */
   function measure(): void {
     const sample = cloud.sample(EXTENT_SAMPLE);
-    const places = sample.length > 0 ? sample : mapping.positions;
-    if (places.length === 0) return;
-    const turned = places.map((place) => new Vector(...place).applyQuaternion(world.quaternion));
-    const [min, max] = [new Vector(), new Vector()];
-    for (const axis of ["x", "y", "z"] as const) {
-      const along = turned.map((place) => place[axis]);
-      const [low, high] = [percentile(along, OUTSIDE), percentile(along, 1 - OUTSIDE)];
-      const rest = ((high - low) * OUTSIDE) / (1 - 2 * OUTSIDE);
-      [min[axis], max[axis]] = [low - rest, high + rest];
-    }
-    const radius = min.distanceTo(max) / 2 || 1; // of a single place, one unit around it
-    const first = extent === null;
-    extent = { min, max, radius, centre: min.clone().add(max).multiplyScalar(0.5) };
+    if (sample.length + mapping.positions.length === 0) return;
+    const inScene = (place: Vector3): Vector =>
+      new Vector(...place).applyQuaternion(world.quaternion);
+    extent = extentOf(sample.map(inScene), mapping.positions.map(inScene));
+    const { radius } = extent;
     steering.bound(radius);
     discard(grid);
     grid = groundGrid(extent, palette);
     scene.add(grid);
-    if (first) viewer.overview();
+    if (framing && !steering.touched) viewer.overview();
   }
 
   /** How deep frusta are drawn: less than what is between cameras, and to be seen in the map. */
@@ -157,10 +152,14 @@ export const createViewer: CreateViewer = (host: HTMLElement, theme: Theme): Vie
 
   function showCameras(): void {
     mapping.set(images, cameras, origin);
-    if (extent === null) measure();
+    measure();
+    paintCameras();
+    describe();
+  }
+
+  function paintCameras(): void {
     mapping.depth = depth();
     mapping.paint(palette);
-    describe();
     request();
   }
 
@@ -250,6 +249,8 @@ export const createViewer: CreateViewer = (host: HTMLElement, theme: Theme): Vie
       discard(grid);
       [images, cameras, poses, trail, coverage] = [[], {}, [], [], []];
       [extent, grid] = [null, null];
+      framing = true;
+      steering.touched = false;
       world.quaternion.copy(sceneFromWorld(up));
       world.updateMatrixWorld();
       cloud.object.quaternion.copy(world.quaternion);
@@ -260,9 +261,8 @@ export const createViewer: CreateViewer = (host: HTMLElement, theme: Theme): Vie
     addPoints(block) {
       cloud.add(block, origin);
       if (block.first === 0) {
-        extent = null; // that of the cameras alone was another one
         measure();
-        if (images.length > 0) showCameras();
+        if (images.length > 0) paintCameras();
         if (poses.length > 0) showPoses();
       }
       describe();
@@ -304,6 +304,7 @@ export const createViewer: CreateViewer = (host: HTMLElement, theme: Theme): Vie
     overview() {
       if (extent === null) return;
       const { position, target } = wholeView(extent, OVERVIEW, steering.camera);
+      framing = true;
       steering.go(position, target, cloud.drawn === 0);
     },
     flyTo(frustum) {
@@ -312,6 +313,7 @@ export const createViewer: CreateViewer = (host: HTMLElement, theme: Theme): Vie
       const back = Math.max(4 * depth(), 0.2 * (extent?.radius ?? 0));
       const behind = add(add(frustum.position, scale(ahead, -1.6 * back)), scale(up, 0.55 * back));
       const target = add(frustum.position, scale(ahead, 1.5 * back));
+      framing = false;
       steering.go(toScene(behind), toScene(target));
     },
     setTheme(given) {
