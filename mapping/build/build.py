@@ -105,8 +105,6 @@ def build_map(
         refuse_long_id(settings.map_id)
     store = open_store(settings.maps_dir, settings.cache_dir)
     refuse_existing_map(settings.map_id, store, force=settings.force)
-    if not is_ready_made(settings.local_features):  # raises when it cannot
-        Networks(settings.weights_dir, settings.inference).extractor(settings.local_features)
     scratch = scratch_folder(settings.maps_dir, settings.cache_dir, settings.map_id)
     work = WorkFolder(work_place(settings.work_dir or settings.maps_dir, settings.map_id))
     try:
@@ -161,6 +159,7 @@ def _context(
         max_keypoints=settings.max_keypoints,
         features_dir=settings.features_dir,
         pixel_origin=settings.pixel_origin,
+        workers=workers,
     )
     return BuildContext(work, features, networks, workers, progress)
 
@@ -304,7 +303,13 @@ class _Job:
             made.imported.write(folder)
         more_doubts = partial(self._more_doubts, made)
         version = write_content(
-            folder, content, map_id, left_out, more_doubts, progress=context.progress
+            folder,
+            content,
+            map_id,
+            left_out,
+            more_doubts,
+            progress=context.progress,
+            workers=context.workers,
         )
         return WrittenMap(folder, map_id, version, len(placed))
 

@@ -12,6 +12,7 @@ from mapping.cluster.workers import Workers
 from mapping.progress import ItemProgress, Progress
 from visloc.errors import refuse
 
+S = TypeVar("S")
 T = TypeVar("T")
 
 EXECUTORS = ("local", "ray")
@@ -40,6 +41,19 @@ class Executor(Protocol):
 
     def run(self, task: Callable[[T], object], items: Sequence[T], progress: ItemProgress) -> None:
         """Do a task for every item; report progress as items are finished.
+
+        Raises:
+            Unavailable: ``build.worker_died``.
+            Exception: what the task raised first; waiting items are dropped.
+        """
+
+    def run_here(
+        self, task: Callable[[T], S], items: Sequence[T], progress: ItemProgress
+    ) -> list[S]:
+        """Do a task for every item on this machine; return the small results in the items' order.
+
+        Worker processes have loaded what networks and matching need. If there are any, this process
+        need not load it too, which would take two seconds.
 
         Raises:
             Unavailable: ``build.worker_died``.

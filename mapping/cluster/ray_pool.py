@@ -15,11 +15,12 @@ from typing import Any, TypeVar
 import ray
 
 from mapping.cluster.stage_timings import Spent
-from mapping.cluster.workers import ONE_THREAD, do_batch, in_batches
+from mapping.cluster.workers import ONE_THREAD, THIS_PROCESS, do_batch, in_batches
 from mapping.progress import ItemProgress, Progress
 from visloc import __version__
 from visloc.errors import refuse
 
+S = TypeVar("S")
 T = TypeVar("T")
 
 # The address of a new cluster on this machine, which ends with the build.
@@ -106,6 +107,11 @@ class RayPool:
             for one in running:
                 ray.cancel(one, force=True)  # results appear whole or not at all
             raise
+
+    def run_here(
+        self, task: Callable[[T], S], items: Sequence[T], progress: ItemProgress
+    ) -> list[S]:
+        return THIS_PROCESS.run_here(task, items, progress)
 
     def run_one(
         self, task: Callable[[T, Progress], object], item: T, stage: str, progress: Progress

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from functools import partial
 from typing import TypeVar
 
 import cv2
@@ -23,6 +24,7 @@ from mapping.cluster.stage_timings import Spent, spent_here
 from mapping.progress import ItemProgress, Progress
 from visloc.errors import refuse
 
+S = TypeVar("S")
 T = TypeVar("T")
 
 # Few machines have memory for more than eight processes of a build.
@@ -37,8 +39,8 @@ ONE_THREAD = {
     "OPENCV_FOR_THREADS_NUM": "1",
 }
 
-# What the tasks of a build need beside networks.
-_PRELOADED = ("mapping.build.build",)
+# What the tasks of a build need. Networks and matching need torch.
+_PRELOADED = ("mapping.build.build", "torch")
 
 # The server's socket lies below the folder of temporary files. Its path has at most 107 bytes, of
 # which multiprocessing appends 32.
@@ -89,17 +91,20 @@ class Workers:
                     task(item)
                     progress(done, len(items))
             return
-        try:
-            with _one_thread_each(), _interrupted_later():
-                futures = [self._pool.submit(do_batch, task, batch) for batch in in_batches(items)]
-            done = 0
-            for future in as_completed(futures):
-                count, spent = future.result()
-                done += count
-                self._spent += spent
-                progress(done, len(items))
-        except BrokenProcessPool as error:
-            raise refuse("build.worker_died", field="--workers") from error
+        self._finish(self._pool, partial(_no_result, task), in_batches(items), len(items), progress)
+
+    def run_here(
+        self, task: Callable[[T], S], items: Sequence[T], progress: ItemProgress
+    ) -> list[S]:
+        progress(0, len(items))
+        if self._pool is None:
+            results = []
+            with one_thread_here():
+                for done, item in enumerate(items, 1):
+                    results.append(task(item))
+                    progress(done, len(items))
+            return results
+        return self._finish(self._pool, partial(_one_result, task), items, len(items), progress)
 
     def run_one(
         self,
@@ -110,6 +115,32 @@ class Workers:
     ) -> None:
         with one_thread_here():
             task(item, progress)
+
+    def _finish(
+        self,
+        pool: ProcessPoolExecutor,
+        work: Callable[[T], tuple[S, int, Spent]],
+        parts: Sequence[T],
+        total: int,
+        progress: ItemProgress,
+    ) -> list[S]:
+        """Do parts of a stage, each of so many items; return their results in their order."""
+        try:
+            with _one_thread_each(), _interrupted_later():
+                futures = [pool.submit(work, part) for part in parts]
+            done = 0
+            for future in as_completed(futures):
+                _, count, spent = future.result()
+                done += count
+                self._spent += spent
+                progress(done, total)
+        except BrokenProcessPool as error:
+            raise refuse("build.worker_died", field="--workers") from error
+        return [future.result()[0] for future in futures]
+
+
+THIS_PROCESS = Workers(1)
+"""Does everything in this process."""
 
 
 def _start_method() -> multiprocessing.context.BaseContext:
@@ -122,8 +153,7 @@ def _start_method() -> multiprocessing.context.BaseContext:
     if len(os.fsencode(tempfile.gettempdir())) > _LONGEST_TEMPORARY:
         return multiprocessing.get_context("spawn")
     context = multiprocessing.get_context("forkserver")
-    needed = [*_PRELOADED, *(["torch"] if "torch" in sys.modules else [])]
-    context.set_forkserver_preload(needed)
+    context.set_forkserver_preload([*_PRELOADED])
     return context
 
 
@@ -139,6 +169,16 @@ def do_batch(task: Callable[[T], object], items: Sequence[T]) -> tuple[int, Spen
     for item in items:
         task(item)
     return len(items), spent_here() - before
+
+
+def _no_result(task: Callable[[T], object], items: Sequence[T]) -> tuple[None, int, Spent]:
+    return (None, *do_batch(task, items))
+
+
+def _one_result(task: Callable[[T], S], item: T) -> tuple[S, int, Spent]:
+    before = spent_here()
+    result = task(item)
+    return result, 1, spent_here() - before
 
 
 def _start_worker(sockets: str) -> None:

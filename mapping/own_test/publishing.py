@@ -7,7 +7,9 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
+from mapping.cluster.executors import Executor
 from mapping.cluster.stage_timings import wrote
+from mapping.cluster.workers import THIS_PROCESS
 from mapping.own_test.trials import run_own_test
 from mapping.own_test.verdict import doubts_about
 from mapping.progress import Progress, nothing_told, one_step
@@ -108,6 +110,7 @@ def write_content(
     examine: Examine | None = None,
     carried: Sequence[Doubt] = (),
     progress: Progress = nothing_told,
+    workers: Executor = THIS_PROCESS,
 ) -> str:
     """Write content beside the files that a folder has already, test it, and return its version.
 
@@ -119,13 +122,14 @@ def write_content(
         carried: doubts about the map that the content was made from. Those that only its build
             could find are kept.
         progress: of the stages "archive" and "own test".
+        workers: where the photos of its own test are localized.
     """
     version, created = new_version()
     with one_step(progress, "archive"):
         write_map(folder, content, map_id=map_id, version=version, created=created)
         wrote(sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()))
     opened = open_map(folder)
-    run = run_own_test(opened, partial(progress, "own test"))
+    run = run_own_test(opened, partial(progress, "own test"), workers)
     doubts = (
         *doubts_about(opened, run, left_out),
         *(examine(opened) if examine else ()),

@@ -5,19 +5,22 @@ The errors that this shows are stored in the map (docs/map-format.md) and widen 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from mapping.cluster.workers import one_thread_here
+from mapping.cluster.executors import Executor
+from mapping.cluster.workers import THIS_PROCESS
 from mapping.frames.stored_queries import solve_stored
 from mapping.own_test.error_model import fitted_factor, mahalanobis2
 from mapping.progress import ItemProgress, not_told
 from mapping.report.held_out import match_held_out, spread_photos, taken_with
-from visloc.archive import Map
+from visloc.archive import Map, open_map
 from visloc.archive.schema import MAX_FACTOR, MAX_WRONG_SCORES, OwnTest, Score
 from visloc.geometry import Pose, center_covariance
 from visloc.localization.acceptance.judge import TIE_ANGLE, TIE_REACH_SHARE
@@ -75,32 +78,28 @@ def own_test(opened: Map) -> OwnTest:
     return run_own_test(opened).test
 
 
-def run_own_test(opened: Map, progress: ItemProgress = not_told) -> OwnTestRun:
+def run_own_test(
+    opened: Map, progress: ItemProgress = not_told, workers: Executor = THIS_PROCESS
+) -> OwnTestRun:
     """Test a map with what it stores of its own photos.
 
     The photos are spread evenly and every random choice has a seed, so that equal maps have equal
     tests.
     """
     geometry = MapGeometry(opened)
-    viewpoints = geometry.viewpoints
     most = min(max(_LEAST_PHOTOS, len(opened.images) // _SHARE_OF_PHOTOS), _MOST_PHOTOS)
     images = spread_photos(len(opened.images), most)
-    tested, trials, localized, refused = 0, [], [], []
-    with one_thread_here():
-        for done, image in enumerate(images):
-            progress(done, len(images))
-            left_out = left_out_with(opened, viewpoints, image)
-            if left_out is None:
-                continue
-            tested += 1
-            trial = _trial(opened, geometry, viewpoints, image, left_out)
-            if trial is None:
-                refused.append(image)
-            else:
-                trials.append(trial)
-                localized.append(image)
-    progress(len(images), len(images))
-    test = learned(trials, tested, geometry.reach, independent=_independent(opened))
+    asked = [
+        (image, left_out)
+        for image in images
+        if (left_out := left_out_with(opened, geometry.viewpoints, image)) is not None
+    ]
+    tried = workers.run_here(_Trials(geometry), asked, progress)
+    found = [(image, trial) for (image, _), trial in zip(asked, tried, strict=True)]
+    refused = [image for image, trial in found if trial is None]
+    localized = [image for image, trial in found if trial is not None]
+    trials = [trial for _, trial in found if trial is not None]
+    test = learned(trials, len(asked), geometry.reach, independent=_independent(opened))
     are_wrong = _are_wrong([trial.error for trial in trials], geometry.reach)
     wrong = [image for image, is_wrong in zip(localized, are_wrong, strict=True) if is_wrong]
     return OwnTestRun(test, tuple(wrong), tuple(refused))
@@ -161,14 +160,28 @@ def left_out_with(opened: Map, viewpoints: Viewpoints, image: int) -> NDArray[np
     return left_out if len(left_out) < len(opened.images) else None
 
 
-def _trial(
-    opened: Map,
-    geometry: MapGeometry,
-    viewpoints: Viewpoints,
-    image: int,
-    left_out: NDArray[np.int64],
-) -> Trial | None:
+class _Trials:
+    """A worker's part of the own test. Each process opens the map once."""
+
+    def __init__(self, geometry: MapGeometry) -> None:
+        self._geometry = geometry
+
+    def __call__(self, asked: tuple[int, NDArray[np.int64]]) -> Trial | None:
+        return _trial(self._geometry, *asked)
+
+    def __reduce__(self) -> tuple[Callable[[Path, str], _Trials], tuple[Path, str]]:
+        opened = self._geometry.opened
+        return _trials_of, (opened.path, opened.manifest.content_hash)
+
+
+@lru_cache(maxsize=1)
+def _trials_of(folder: Path, _content_hash: str) -> _Trials:
+    return _Trials(MapGeometry(open_map(folder)))
+
+
+def _trial(geometry: MapGeometry, image: int, left_out: NDArray[np.int64]) -> Trial | None:
     """Localize one photo in what the map would be without some; None when it is refused."""
+    opened, viewpoints = geometry.opened, geometry.viewpoints
     options = LocalizeOptions(top_k=_PHOTOS_ASKED)
     num = len(opened.observations(image)[0])
     rows = np.random.default_rng(image).permutation(num)[:_MOST_KEYPOINTS]

@@ -11,6 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
+from mapping.cluster.executors import Executor
+from mapping.cluster.workers import THIS_PROCESS
+from mapping.progress import not_told
 from mapping.stages.camera_mask import CameraMask, are_masked
 from mapping.stages.networks import Networks, refuse_other_computing
 from mapping.stages.photos import MappingPhoto
@@ -232,6 +235,7 @@ def local_features_source(
     max_keypoints: int,
     features_dir: Path | None,
     pixel_origin: PixelOrigin,
+    workers: Executor = THIS_PROCESS,
 ) -> LocalFeaturesSource:
     """Return the source of local features that a name stands for.
 
@@ -241,6 +245,7 @@ def local_features_source(
         max_keypoints: strongest ones kept per photo; of ready-made features all are taken.
         features_dir: folder of ready-made features, if not the dataset.
         pixel_origin: of the coordinates of ready-made keypoints.
+        workers: where the extractor is opened, to learn its properties.
 
     Raises:
         WeightsError, InvalidInput, DatasetError: what opening them raises.
@@ -248,7 +253,7 @@ def local_features_source(
     if is_ready_made(name):
         keypoints, descriptors = open_local_features(dataset, ready_made_type(name), features_dir)
         return ReadyMadeFeatures(keypoints, descriptors, pixel_origin)
-    extractor = networks.extractor(name)
+    (extractor,) = workers.run_here(networks.properties, [name], not_told)
     return ExtractedFeatures(
         work,
         name,

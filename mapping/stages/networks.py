@@ -14,6 +14,16 @@ from visloc.features import (
     make_local_features,
 )
 from visloc.options import Inference
+from visloc.types import Fingerprint
+
+
+@dataclass(frozen=True, slots=True)
+class ExtractorProperties:
+    """Properties of a feature extractor; see ``LocalFeatureExtractor``."""
+
+    fingerprint: Fingerprint
+    descriptor_dim: int
+    computed_with: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +40,11 @@ class Networks:
             WeightsError, InvalidInput: what ``make_local_features`` raises.
         """
         return open_extractor(name, self)
+
+    def properties(self, name: str) -> ExtractorProperties:
+        """Return the properties of an extractor; raises what ``extractor`` raises."""
+        found = self.extractor(name)
+        return ExtractorProperties(found.fingerprint, found.descriptor_dim, found.computed_with)
 
     def descriptor(self, name: str) -> GlobalDescriptor:
         """Return this process's global descriptor; raises what ``extractor`` raises."""

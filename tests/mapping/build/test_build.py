@@ -529,7 +529,7 @@ def test_killed_in_any_stage_the_same_command_resumes_and_makes_the_same_map(
         "progress:localvlad:1",
         "progress:depth:4",
         "call:mapping.methods.rgbd:merge_landmarks",
-        "call:visloc.archive.writer:manifest_hash",  # all arrays are written, no manifest
+        "call:visloc.archive.files:manifest_hash",  # all arrays are written, no manifest
         "call:visloc.archive.backends.folder:_sync_folder",  # the version is there, not current
     ):
         killed = run_build(sample / "mapping", maps_dir, trouble)
