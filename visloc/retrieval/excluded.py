@@ -41,12 +41,25 @@ def excluded_photos(
     # takes longest to find out. Besides a photo that counts, at most four allowed and four excluded
     # ones are as good.
     everywhere = retrieve(query, index, 2 * _NUM_PHOTOS - 1, fusion=fusion)
-    others = np.flatnonzero(photo_weights[everywhere.images] == 0)[:_NUM_PHOTOS]
+    among = np.flatnonzero(photo_weights[everywhere.images] == 0)[:_NUM_PHOTOS]
+    if len(among) < _NUM_PHOTOS and _are_better(everywhere, retrieved, fusion).all():
+        # More allowed photos than four are as good: they are not in ``retrieved``, because they
+        # count little, or because the caller chose others.
+        excluded = np.asarray(photo_weights == 0, dtype=np.float64)
+        everywhere = retrieve(query, index, _NUM_PHOTOS, excluded, fusion)
+        among = np.arange(len(everywhere.images))
+    others = Retrieved(
+        everywhere.images[among],
+        everywhere.scores[among],
+        {name: row[among] for name, row in everywhere.similarities.items()},
+    )
+    return np.asarray(others.images[_are_better(others, retrieved, fusion)])
+
+
+def _are_better(found: Retrieved, retrieved: Retrieved, fusion: LateFusion) -> NDArray[np.bool_]:
+    """Return which of the photos that were found (k,) are better than the fifth retrieved."""
     # Fuse both lists together: scores that are ranks only compare within one ranking.
-    similarities = {
-        name: np.concatenate([retrieved.similarities[name], everywhere.similarities[name][others]])
-        for name in query
-    }
-    scores, num = fusion.scores(similarities), len(retrieved.images)
+    both, num = (retrieved.similarities, found.similarities), len(retrieved.images)
+    scores = fusion.scores({name: np.concatenate([f[name] for f in both]) for name in both[0]})
     best = np.sort(scores[:num])[::-1][:_NUM_PHOTOS]
-    return np.asarray(everywhere.images[others[scores[num:] > best.min(initial=np.inf)]])
+    return np.asarray(scores[num:] > best.min(initial=np.inf))

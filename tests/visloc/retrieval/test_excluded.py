@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from visloc.options import Fusion
 from visloc.retrieval.excluded import excluded_photos
 from visloc.retrieval.fusion import LateFusion
-from visloc.retrieval.index import retrieve
+from visloc.retrieval.index import Retrieved, compare, retrieve
 from visloc.retrieval.rows import GlobalRows
 
 NUM, DIM = 60, 6
@@ -18,6 +18,25 @@ NUM, DIM = 60, 6
 def units(rng: np.random.Generator, *shape: int) -> NDArray[np.float32]:
     vectors = rng.normal(size=shape)
     return (vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)).astype(np.float32)
+
+
+def scores_of(
+    query: dict[str, NDArray[np.float32]], index: dict[str, GlobalRows], fusion: LateFusion
+) -> NDArray[np.float64]:
+    return fusion.scores({name: rows.cosines(query[name]) for name, rows in index.items()})
+
+
+def expected(
+    query: dict[str, NDArray[np.float32]],
+    index: dict[str, GlobalRows],
+    weights: NDArray[np.float64],
+    fusion: LateFusion,
+    best_allowed: NDArray[np.float64],
+) -> list[int]:
+    """Return the five best excluded photos, as far as they are better than the fifth allowed."""
+    scores, excluded = scores_of(query, index, fusion), np.flatnonzero(weights == 0)
+    best = excluded[np.argsort(-scores[excluded], kind="stable")][:5]
+    return best[scores[best] > best_allowed.min(initial=np.inf)].tolist()
 
 
 @pytest.mark.parametrize("operator", [Fusion.GHARM, Fusion.MEAN, Fusion.MIN])
@@ -34,12 +53,33 @@ def test_photos_count_if_they_are_better_than_the_fifth_that_is_allowed(
     allowed = retrieve(query, index, 20, weights, fusion)
     found = excluded_photos(query, index, allowed, weights, fusion)
 
-    scores = fusion.scores({name: rows.cosines(query[name]) for name, rows in index.items()})
-    best_allowed = np.sort(scores[weights > 0])[::-1][:5]
-    excluded = np.flatnonzero(weights == 0)
-    best_excluded = excluded[np.argsort(-scores[excluded], kind="stable")][:5]
-    expected = best_excluded[scores[best_excluded] > best_allowed.min(initial=np.inf)]
-    assert found.tolist() == expected.tolist()
+    best_allowed = np.sort(scores_of(query, index, fusion)[weights > 0])[::-1][:5]
+    assert found.tolist() == expected(query, index, weights, fusion, best_allowed)
+
+
+@pytest.mark.parametrize("chosen", [False, True])
+@pytest.mark.parametrize("seed", range(20))
+def test_allowed_photos_that_are_not_compared_hide_no_excluded_ones(
+    seed: int, *, chosen: bool
+) -> None:
+    """Photos at the edge of a prior hardly count; others are left out by a caller who names some."""
+    rng = np.random.default_rng(seed)
+    index = {name: GlobalRows(units(rng, NUM, DIM)) for name in ("a", "b")}
+    query, fusion = {name: units(rng, DIM) for name in index}, LateFusion()
+    scores = scores_of(query, index, fusion)
+    weights = np.where(rng.uniform(size=NUM) < 0.2, 0.0, 1.0 if chosen else 0.01)
+    weights[np.argsort(scores)[: NUM // 2]] = 1.0
+    retrieved: Retrieved = (
+        compare(query, index, np.argsort(scores)[:10], weights, fusion)
+        if chosen
+        else retrieve(query, index, 10, weights, fusion)
+    )
+
+    found = excluded_photos(query, index, retrieved, weights, fusion)
+
+    compared = np.sort(scores[retrieved.images])[::-1][:5]
+    assert found.tolist() == expected(query, index, weights, fusion, compared)
+    assert len(found) == min(5, np.count_nonzero(weights == 0))
 
 
 def test_nothing_is_excluded_without_priors_or_where_all_or_none_are_allowed() -> None:
