@@ -65,7 +65,7 @@ class Workers:
                 count,
                 mp_context=_start_method(),
                 initializer=_start_worker,
-                initargs=(multiprocessing.util.get_temp_dir(),),
+                initargs=(_own_sockets(),),
             )
             if count > 1
             else None
@@ -153,7 +153,7 @@ def _start_method() -> multiprocessing.context.BaseContext:
     if len(os.fsencode(tempfile.gettempdir())) > _LONGEST_TEMPORARY:
         return multiprocessing.get_context("spawn")
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([*_PRELOADED])
+    context.set_forkserver_preload(list(_PRELOADED))
     return context
 
 
@@ -181,22 +181,29 @@ def _one_result(task: Callable[[T], S], item: T) -> tuple[S, int, Spent]:
     return result, 1, spent_here() - before
 
 
-def _start_worker(sockets: str) -> None:
-    """Begin a worker of a build whose sockets lie in a folder of temporary files."""
+def _own_sockets() -> str | None:
+    """Return the folder of this process's sockets; None in a child, which uses its parent's."""
+    is_child = multiprocessing.parent_process() is not None
+    return None if is_child else multiprocessing.util.get_temp_dir()
+
+
+def _start_worker(sockets: str | None) -> None:
+    """Begin a worker of a build that has a folder of sockets of its own, or None."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     threading.Thread(target=_end_with_parent, args=(sockets,), daemon=True).start()
 
 
-def _end_with_parent(sockets: str) -> None:
+def _end_with_parent(sockets: str | None) -> None:
     """End a worker whose build was killed; it would wait for work forever.
 
-    A build that is killed cannot remove its folder of sockets. It does not lie in the work folder:
-    paths of sockets are short, and shared disks hold none.
+    A build that is killed cannot remove its folder of sockets. The folder does not lie in the work
+    folder: paths of sockets are short, and shared disks hold none.
     """
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()
-    shutil.rmtree(sockets, ignore_errors=True)  # another worker may be faster
+    if sockets is not None:
+        shutil.rmtree(sockets, ignore_errors=True)  # another worker may be faster
     os._exit(1)
 
 

@@ -59,6 +59,13 @@ test.each([
   ["with a rotation that is none", link().hash.replace("3,1,0,0,0", "3,1,1,0,0")],
   ["with another thing for a camera", link().hash.replace("SIMPLE_PINHOLE", "<img src=x>")],
   ["with half of a place", link().hash.replace(/earth=[^&]*/, "earth=46.8,-91.9")],
+  ["with a number too large to draw", link().hash.replace("1.25", "1e300")],
+  ["with a number that is infinite", link().hash.replace("1.25", "Infinity")],
+  ["with a negative variance", link().hash.replace("spread=", "spread=-")],
+  ["without a focal length", link().hash.replace("SIMPLE_PINHOLE,4,3,4,2", "PINHOLE,4,3,4,0")],
+  ["of no latitude", link().hash.replace("46.8", "146.8")],
+  ["of no heading", link().hash.replace(/(earth=[^&]*,)[^,&]*/, "$15")],
+  ["more than certain", link().hash.replace("probability=0", "probability=7")],
 ])("a link %s is damaged", (_, hash) => {
   expect(sharedPose(hash)).toBe("damaged");
 });

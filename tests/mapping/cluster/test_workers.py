@@ -9,7 +9,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from functools import partial
-from multiprocessing import forkserver
+from multiprocessing import forkserver, util
 from pathlib import Path
 
 import cv2
@@ -39,6 +39,15 @@ def write_threads(folder: Path, name: str) -> None:
 
 def ignore(_done: int, _total: int) -> None:
     pass
+
+
+def be_killed(folder: Path) -> None:
+    """Work with two workers in a child of another process, and die."""
+    workers = Workers(2)
+    workers.run(partial(write_square, folder), range(2), ignore)
+    pids = [str(worker.pid) for worker in multiprocessing.active_children()]
+    (folder / "workers").write_text("\n".join(pids))
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 # Runs the command with trouble ahead: "progress:STAGE:DONE" kills it there, "call:MODULE:FUNCTION"
@@ -127,7 +136,6 @@ def wait_for_the_end_of_workers(folder: Path) -> None:
         assert time.monotonic() < deadline, "a worker outlived its build"
         time.sleep(0.05)
     (folder / "workers").unlink()
-    assert not Path((folder / "sockets").read_text()).exists()
 
 
 @pytest.mark.parametrize("count", [1, 2])
@@ -184,6 +192,18 @@ def test_a_worker_that_dies_is_an_error_with_advice() -> None:
     assert (caught.value.code, caught.value.field) == ("build.worker_died", "--workers")
 
 
+def test_workers_of_a_killed_child_leave_the_folder_of_sockets_to_its_parent(
+    tmp_path: Path,
+) -> None:
+    shared = Path(util.get_temp_dir())
+    child = multiprocessing.get_context("spawn").Process(target=be_killed, args=(tmp_path,))
+    child.start()
+    child.join()
+    assert child.exitcode == -signal.SIGKILL
+    wait_for_the_end_of_workers(tmp_path)
+    assert shared.is_dir()
+
+
 def test_two_workers_make_the_same_map_by_depth(
     walk: Path, tmp_path: Path, rgbd_walk: Map, build_walk: Build
 ) -> None:
@@ -204,6 +224,7 @@ def test_killed_with_its_workers_the_same_command_resumes_and_makes_the_same_map
         killed = run_build(trouble)
         assert killed.returncode == -signal.SIGKILL, (trouble, killed.stderr)
         wait_for_the_end_of_workers(tmp_path)
+        assert not Path((tmp_path / "sockets").read_text()).exists()
         found = items_of(maps_dir)
         assert found.items() >= items.items(), trouble  # nothing finished was done again
         assert len(found) > len(items)

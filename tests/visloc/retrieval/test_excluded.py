@@ -62,7 +62,7 @@ def test_photos_count_if_they_are_better_than_the_fifth_that_is_allowed(
 def test_allowed_photos_that_are_not_compared_hide_no_excluded_ones(
     seed: int, *, chosen: bool
 ) -> None:
-    """Photos at the edge of a prior hardly count; others are left out by a caller who names some."""
+    """Photos at the edge of a prior hardly count, and a caller who names photos leaves some out."""
     rng = np.random.default_rng(seed)
     index = {name: GlobalRows(units(rng, NUM, DIM)) for name in ("a", "b")}
     query, fusion = {name: units(rng, DIM) for name in index}, LateFusion()

@@ -331,6 +331,7 @@ export function createPhotoPanel(host: HTMLElement, parts: PhotoPanelParts): Pho
       flyTo(0);
     },
     showShared(pose) {
+      shared = null; // the address is that of the new link already
       parts.open();
       startDrawing();
       selected = null;

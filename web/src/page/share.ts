@@ -1,4 +1,4 @@
-// A pose as an address: who opens it sees the pose in the map. The photo is not in it.
+// A pose as an address: opening it shows the pose in the map. The photo is not in it.
 import {
   mapRef,
   type Camera,
@@ -7,9 +7,12 @@ import {
   type Quaternion,
   type Vector3,
 } from "visloc-client";
-import type { Matrix3 } from "../geometry";
+import { cornerRays, type Matrix3 } from "../geometry";
 import type { ShownPose } from "../viewer/types";
 import { covarianceOfPosition } from "./shown_pose";
+
+// No map reaches further from its origin. Beyond, the view's numbers of 32 bits would overflow.
+const LARGEST = 1e9;
 
 /** A pose that an address holds: numbers that anybody may have written. */
 export interface SharedPose {
@@ -37,7 +40,8 @@ export function poseLink(page: URL, answer: LocalizeResponse): string | null {
   const parts = [
     ["map", mapRef(answer.map)],
     ["pose", [...numbers(pose.position, 9), ...numbers(pose.orientation)].join()],
-    ["spread", numbers([xx, xy, xz, yy, yz, zz], 4).join()],
+    // Rounding may leave a variance of almost zero below it.
+    ["spread", numbers([Math.max(xx, 0), xy, xz, Math.max(yy, 0), yz, Math.max(zz, 0)], 4).join()],
     ["camera", [camera.model, camera.width, camera.height, ...numbers(camera.params)].join()],
     ...(pose.probability === null ? [] : [["probability", pose.probability.toFixed(3)]]),
     ...(earth ? [["earth", earth.join()]] : []),
@@ -63,11 +67,17 @@ export function sharedPose(hash: string): SharedPose | "damaged" | null {
   const probability = given.has("probability") ? read(given.get("probability"), 1) : null;
   const whole = map !== "" && pose !== null && spread !== null && camera !== null;
   if (!whole || (given.has("earth") && earth === null)) return "damaged";
-  if (given.has("probability") && probability === null) return "damaged";
+  if (given.has("probability") && !(probability !== null && within(probability[0]!, 0, 1))) {
+    return "damaged";
+  }
   const orientation = pose.slice(3) as Quaternion;
-  if (Math.abs(Math.hypot(...orientation) - 1) > 1e-3) return "damaged";
+  if (!isRotation(orientation)) return "damaged";
   const [xx, xy, xz, yy, yz, zz] = spread as [number, number, number, number, number, number];
+  if (Math.min(xx, yy, zz) < 0) return "damaged";
   const [lat, lon, h, x, y, z, w] = (earth ?? []) as number[];
+  const onEarth = (): boolean =>
+    within(lat!, -90, 90) && within(lon!, -180, 180) && isRotation([w!, x!, y!, z!]);
+  if (earth !== null && !onEarth()) return "damaged";
   return {
     map,
     shown: {
@@ -93,8 +103,16 @@ function numbers(values: readonly number[], significant = 7): string[] {
 
 function read(text: string | null, count: number): number[] | null {
   const values = (text ?? "").split(",").map((word) => (word.trim() === "" ? NaN : Number(word)));
-  return values.length === count && values.every(Number.isFinite) ? values : null;
+  const known = values.every((value) => within(value, -LARGEST, LARGEST));
+  return values.length === count && known ? values : null;
 }
+
+/** False of NaN. */
+const within = (value: number, least: number, most: number): boolean =>
+  value >= least && value <= most;
+
+const isRotation = (quaternion: Quaternion): boolean =>
+  Math.abs(Math.hypot(...quaternion) - 1) <= 1e-3;
 
 function readCamera(text: string | null): Camera | null {
   const [model, ...words] = (text ?? "").split(",");
@@ -102,5 +120,6 @@ function readCamera(text: string | null): Camera | null {
   if (!/^[A-Z_0-9]{3,30}$/.test(model ?? "") || values === null || values.length < 3) return null;
   const [width, height, ...params] = values as [number, number, ...number[]];
   if (!(width > 0 && height > 0 && params[0]! > 0)) return null;
-  return { model: model!, width, height, params };
+  const camera = { model: model!, width, height, params };
+  return cornerRays(camera).flat().every(Number.isFinite) ? camera : null;
 }
