@@ -48,7 +48,10 @@ def main(
         kept = folder / f"{name}.json"
         if not kept.exists() or commit.endswith("+"):
             typer.echo(f"{name} ...", err=True)
-            measured = _measured(name, commit, data.resolve(), folder)
+            try:
+                measured = _measured(name, commit, data.resolve(), folder)
+            except (subprocess.CalledProcessError, ValueError) as error:
+                sys.exit(f"table {name} was not measured: {error}")
             write_atomically(kept, json.dumps(asdict(measured), indent=1).encode())
         measured = Measured(**json.loads(kept.read_text(encoding="utf-8")))
         if measure_only:

@@ -66,6 +66,18 @@ def test_runs_are_joined_under_one_header() -> None:
         joined_rows([("", "nothing")])
 
 
+@pytest.mark.parametrize(
+    ("script", "why"), [("raise SystemExit(3)", "exit status 3"), ("print('none')", "no table")]
+)
+def test_a_table_that_cannot_be_measured_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, script: str, why: str
+) -> None:
+    monkeypatch.setattr(command, "TABLES", {"one": Table({"": ("-c", script)})})
+    with pytest.raises(SystemExit, match=f"table one was not measured: .*{why}"):
+        command.main(["one"], tmp_path / "data", tmp_path / "work", measure_only=True)
+    assert not list((tmp_path / "work").rglob("*.json"))
+
+
 def test_what_was_measured_is_not_measured_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

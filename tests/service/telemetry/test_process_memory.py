@@ -2,12 +2,14 @@ from __future__ import annotations
 
 import asyncio
 import ctypes
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-from service.telemetry.process_memory import give_back_memory, resident_memory
+from service.telemetry.process_memory import give_back_memory, resident_memory, use_one_heap
 
 
 def write(path: Path, text: str) -> None:
@@ -38,7 +40,7 @@ def test_freed_memory_is_given_back_again_and_again(monkeypatch: pytest.MonkeyPa
             if given == 3:
                 loop.call_soon_threadsafe(third.set)
 
-        libc = SimpleNamespace(malloc_trim=trim, mallopt=lambda *_: None)
+        libc = SimpleNamespace(malloc_trim=trim)
         monkeypatch.setattr(ctypes, "CDLL", lambda _: libc)
         monkeypatch.setattr("service.telemetry.process_memory._GIVE_BACK_EVERY_S", 0.0)
         giving = asyncio.create_task(give_back_memory())
@@ -51,4 +53,38 @@ def test_freed_memory_is_given_back_again_and_again(monkeypatch: pytest.MonkeyPa
 def test_another_c_library_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ctypes, "CDLL", lambda _: SimpleNamespace())
 
+    use_one_heap()
     asyncio.run(give_back_memory())
+
+
+# Prints whether a block that a thread gets lies in the heap of the main thread.
+IN_HEAP = """
+import ctypes, threading
+from pathlib import Path
+from service.telemetry.process_memory import use_one_heap
+
+libc = ctypes.CDLL(None)
+libc.malloc.restype = ctypes.c_void_p
+if USED:
+    use_one_heap()
+
+def ask(size):
+    at = libc.malloc(ctypes.c_size_t(size))
+    lines = Path("/proc/self/maps").read_text().splitlines()
+    (heap,) = [line.split()[0] for line in lines if "[heap]" in line]
+    first, last = (int(each, 16) for each in heap.split("-"))
+    print(first <= at < last)
+
+for size in (64 * 2**20, 1000):
+    thread = threading.Thread(target=ask, args=(size,))
+    thread.start()
+    thread.join()
+"""
+
+
+@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "malloc_trim"), reason="this is not glibc")
+@pytest.mark.parametrize("used", [False, True])
+def test_blocks_of_all_threads_and_sizes_lie_in_one_heap(*, used: bool) -> None:
+    code = f"USED = {used}\n{IN_HEAP}"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == [str(used)] * 2
