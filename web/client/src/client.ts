@@ -168,7 +168,7 @@ export function connect(server: string | URL, settings: Settings = {}): Client {
         answers += 1;
       }
     } finally {
-      ended.abort(); // whoever leaves the loop wants no more of it
+      ended.abort(); // after the caller left the loop, nobody reads the rest
     }
     if (answers !== call.instants.length) {
       const got = `${answers} answers to ${call.instants.length} instants`;
