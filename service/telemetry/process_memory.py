@@ -40,9 +40,9 @@ def resident_memory(
 def use_one_heap() -> None:
     """Let all threads share one heap that keeps what is freed. Call it before other threads begin.
 
-    By default glibc maps new pages for every large block. A gRPC message of 60 MB then costs the
-    event loop 0.09 s, nearly all of it in the kernel, which clears the pages; in memory that was
-    used before it costs 0.02 s. And it gives each thread a heap, from whose end ``malloc_trim``
+    By default glibc maps new pages for every large block. The event loop copies each gRPC message,
+    and most of the time that this takes is the kernel's, which clears the pages
+    (docs/reliability.md). And glibc gives each thread a heap, from whose end ``malloc_trim``
     returns nothing. Does nothing without glibc.
     """
     libc = ctypes.CDLL(None)
