@@ -36,7 +36,7 @@ def expected(
     """Return the five best excluded photos, as far as they are better than the fifth allowed."""
     scores, excluded = scores_of(query, index, fusion), np.flatnonzero(weights == 0)
     best = excluded[np.argsort(-scores[excluded], kind="stable")][:5]
-    return best[scores[best] > best_allowed.min(initial=np.inf)].tolist()
+    return [int(photo) for photo in best if scores[photo] > best_allowed.min(initial=np.inf)]
 
 
 @pytest.mark.parametrize("operator", [Fusion.GHARM, Fusion.MEAN, Fusion.MIN])
