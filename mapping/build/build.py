@@ -58,6 +58,7 @@ from mapping.stages.work_folder import WorkFolder, exclusive
 from visloc.archive import GlobalFeatures, Map, MapStore
 from visloc.archive.schema import Doubt
 from visloc.errors import refuse
+from visloc.features import check_local_features
 from visloc.features.backends.choice import choose_inference
 from visloc.features.local.readymade import is_ready_made
 from visloc.kapture import Dataset
@@ -105,6 +106,8 @@ def build_map(
         refuse_long_id(settings.map_id)
     store = open_store(settings.maps_dir, settings.cache_dir)
     refuse_existing_map(settings.map_id, store, force=settings.force)
+    if not is_ready_made(settings.local_features):
+        check_local_features(settings.local_features)
     scratch = scratch_folder(settings.maps_dir, settings.cache_dir, settings.map_id)
     work = WorkFolder(work_place(settings.work_dir or settings.maps_dir, settings.map_id))
     try:

@@ -96,8 +96,8 @@ def read_fixes(folder: Path, files: Mapping[str, Any]) -> Fixes | None:
     """Return the fixes that a map keeps; None for a map without any.
 
     Args:
-        folder: of the map.
-        files: by name, those of its manifest.
+        folder: the map's folder.
+        files: the files that the map's manifest lists, by name.
 
     Raises:
         MapCorrupt: ``map.json`` when the file is damaged.

@@ -32,6 +32,7 @@ __all__ = [
     "GlobalDescriptor",
     "ImageDescriptor",
     "LocalFeatureExtractor",
+    "check_local_features",
     "global_feature_names",
     "local_feature_names",
     "make_global_descriptor",
@@ -69,6 +70,15 @@ def local_feature_names() -> list[str]:
 def global_feature_names() -> list[str]:
     """Return the names of all installed global descriptors, plug-ins included."""
     return sorted({*GLOBAL_FEATURES, *plugin_names(GLOBAL_FEATURES_GROUP)})
+
+
+def check_local_features(name: str) -> None:
+    """Refuse a name that no installed local features have, without loading any.
+
+    Raises:
+        InvalidInput: ``features.unknown``.
+    """
+    _refuse_unknown(LOCAL_FEATURES, LOCAL_FEATURES_GROUP, name)
 
 
 def make_local_features(
@@ -115,8 +125,13 @@ def _make(
     if name in registry:
         module, function = registry[name]
         return getattr(import_module(module), function)(weights_dir, inference, threads)
+    _refuse_unknown(registry, group, name)
+    return make_plugin(group, name, weights_dir, inference, threads)
+
+
+def _refuse_unknown(registry: Mapping[str, tuple[str, str]], group: str, name: str) -> None:
     others = plugin_names(group)
-    if name not in others:
+    if name not in registry and name not in others:
         message = "the features are unknown; if a package provides them, install that package"
         unusable = passed_over(group)
         if unusable:
@@ -131,4 +146,3 @@ def _make(
             expected=sorted({*registry, *others}),
             got=name,
         )
-    return make_plugin(group, name, weights_dir, inference, threads)

@@ -50,7 +50,7 @@ def ask(with_engine: WithEngine, image: bytes, camera: Camera, **options: Any) -
 
 
 def held(image: bytes, degrees: int) -> bytes:
-    """What a camera stores that is held turned, without EXIF."""
+    """Return the photo that a camera turned by so many degrees stores, without EXIF."""
     return png(turned_pixels(read_photo(image).rgb, HELD[degrees]))
 
 
