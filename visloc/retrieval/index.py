@@ -169,11 +169,10 @@ def _proposed(
     photos, limits = [], {}
     for name, file in files.items():
         lists = file.nearest_lists(query[name], num_lists)
-        found, rough = file.rough_cosines(query[name], lists, allowed)
-        best = largest(rough, count)
-        photos.append(found[best])
-        enough = len(best) == count
-        limits[name] = float(rough[best].min()) + file.error if enough else _ABOVE_ALL
+        found, rough = file.most_alike(query[name], lists, count, allowed)
+        photos.append(found)
+        enough = len(found) == count
+        limits[name] = float(rough.min()) + file.error if enough else _ABOVE_ALL
     return np.unique(np.concatenate(photos)), limits
 
 

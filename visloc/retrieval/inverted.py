@@ -26,6 +26,8 @@ _BLOCK_ROWS = 4096
 # Codes fill whole words of so many bits, so that the numbers after them are aligned.
 _WORD_BITS = 64
 ID_BYTES, FACTOR_BYTES = 8, 8
+# Codes that are compared, for each row that is wanted, before those of other lists are bounded.
+_FIRST_CODES = 10
 # A query is rounded to so many bits before it is compared with codes.
 _QUERY_BITS = 6
 # Numbers converted to float32 at once: 1 MiB stays in the cache of a core, and is too small for
@@ -99,24 +101,55 @@ class InvertedFile:
     def nearest_lists(
         self, query: NDArray[np.float32], count: int, among: NDArray[np.int64] | None = None
     ) -> NDArray[np.int64]:
-        """The lists (k,) whose centres have the largest cosines to a query, at most ``count``.
+        """The lists (k,) whose centres have the largest cosines to a query, best first.
 
         Args:
             query: unit vector (D,).
-            count: at least 1.
+            count: how many lists at most, at least 1.
             among: (m,) the lists that are considered; None for all.
         """
         wide = _widened(query[None], self.centers.shape[1])[0]
         cosines = dot_products(self.centers, wide, among)
         cosines /= self._lengths if among is None else self._lengths[among]
         best = largest(cosines, count)
+        best = best[np.argsort(-cosines[best])]
         return best if among is None else among[best]
+
+    def most_alike(
+        self,
+        query: NDArray[np.float32],
+        lists: NDArray[np.int64],
+        count: int,
+        allowed: NDArray[np.bool_] | None = None,
+    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """The rows (k,) with the largest rough cosines, at most ``count``, and those cosines (k,).
+
+        Both as ``rough_cosines`` returns them for all lists, but faster: what the first lists hold
+        bounds what can count in the others.
+
+        Args:
+            query: unit vector (D,).
+            lists: the lists that are searched, best first.
+            count: at least 1.
+            allowed: (n,) the rows that may come; None for all.
+        """
+        end = 1 + np.searchsorted(np.cumsum(self.sizes[lists]), _FIRST_CODES * count)
+        rows, cosines = self.rough_cosines(query, lists[:end], allowed)
+        if end < len(lists):
+            best = largest(cosines, count)
+            rows, cosines = rows[best], cosines[best]
+            least = float(cosines.min()) if len(best) == count else -np.inf
+            others = self.rough_cosines(query, lists[end:], allowed, least)
+            rows, cosines = (np.concatenate(a) for a in zip((rows, cosines), others, strict=True))
+        best = largest(cosines, count)
+        return rows[best], cosines[best]
 
     def rough_cosines(
         self,
         query: NDArray[np.float32],
         lists: NDArray[np.int64],
         allowed: NDArray[np.bool_] | None = None,
+        above: float = -np.inf,
     ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """Compare a query with the codes of some lists; return rows (m,) and cosines (m,).
 
@@ -127,6 +160,7 @@ class InvertedFile:
             query: unit vector (D,).
             lists: the lists that are searched.
             allowed: (n,) the rows that may come; None for all.
+            above: only rows with larger cosines are returned.
         """
         faiss = _faiss()
         chosen = faiss.IVFRaBitQSearchParameters()
@@ -140,7 +174,7 @@ class InvertedFile:
         wide, found = _widened(query[None], self.centers.shape[1]), faiss.RangeSearchResult(1)
         arrays = map(faiss.swig_ptr, (probed, distances))
         self._index.range_search_preassigned_c(
-            1, faiss.swig_ptr(wide), -np.inf, *arrays, found, False, chosen
+            1, faiss.swig_ptr(wide), above, *arrays, found, False, chosen
         )
         num = int(faiss.rev_swig_ptr(found.lims, 2)[1])
         rows, cosines = (faiss.rev_swig_ptr(a, num) for a in (found.labels, found.distances))
@@ -173,8 +207,10 @@ def dot_products(
     block = np.empty((min(num, block_rows), matrix.shape[1]), np.float32)
     for start in range(0, num, block_rows):
         some = slice(start, min(start + block_rows, num))
-        wide = block[: some.stop - some.start]
-        wide[...] = matrix[some if rows is None else rows[some]]
+        wide = matrix[some if rows is None else rows[some]]
+        if wide.dtype != np.float32:
+            block[: len(wide)] = wide
+            wide = block[: len(wide)]
         np.matmul(wide, vector, out=found[some])
     return found
 

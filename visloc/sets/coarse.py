@@ -145,11 +145,11 @@ def _proposed(
     """Return the tiles of the photos most similar to a rotated query, in the order of the set."""
     inverted = coarse.inverted
     count = max(_MIN_LISTS, math.ceil(_SHARE_OF_LISTS * len(inverted.sizes)))
-    lists = inverted.nearest_lists(query, count, _lists_of(coarse, tiles))
-    photos, cosines = inverted.rough_cosines(query, lists)
-    best = largest(cosines, _NUM_PROPOSED)
-    best = best[np.argsort(-cosines[best])]
-    found = np.searchsorted(coarse.offsets, photos[best], "right") - 1
+    among = None if len(tiles) == len(coarse.offsets) - 1 else _lists_of(coarse, tiles)
+    lists = inverted.nearest_lists(query, count, among)
+    photos, cosines = inverted.most_alike(query, lists, _NUM_PROPOSED)
+    photos = photos[np.argsort(-cosines)]
+    found = np.searchsorted(coarse.offsets, photos, "right") - 1
     found = found[np.isin(found, tiles)]  # a damaged list may name photos of another tile
     _, first = np.unique(found, return_index=True)
     return np.sort(found[np.sort(first)[:MAX_RANKED]])

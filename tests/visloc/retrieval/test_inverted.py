@@ -128,10 +128,28 @@ def test_lists_near_a_query_are_those_of_the_largest_products(
     assert opened is not None
     query = query_like(index, 7, 0)["a"]
     products = unit(opened.centers)[:, :DIM] @ query
-    assert set(opened.nearest_lists(query, 5)) == set(np.argsort(-products)[:5])
+    assert list(opened.nearest_lists(query, 5)) == list(np.argsort(-products)[:5])
     among = np.arange(10, 20)
     best = among[np.argsort(-products[among])[:3]]
-    assert set(opened.nearest_lists(query, 3, among)) == set(best)
+    assert list(opened.nearest_lists(query, 3, among)) == list(best)
+
+
+@pytest.mark.parametrize("count", [1, 3, 40, 1000])
+def test_the_rows_most_alike_are_those_of_all_lists_however_few_are_searched_first(
+    index: dict[str, GlobalRows], count: int
+) -> None:
+    opened = index["a"].inverted
+    assert opened is not None
+    rng = np.random.default_rng(count)
+    for allowed in (None, rng.random(NUM) < 0.3):
+        for photo in range(0, NUM, 40):
+            query = query_like(index, photo, photo)["a"]
+            lists = opened.nearest_lists(query, len(opened.sizes))
+            _, rough = opened.rough_cosines(query, lists, allowed)
+            found, cosines = opened.most_alike(query, lists, count, allowed)
+            assert len(np.unique(found)) == len(found)
+            assert allowed is None or allowed[found].all()
+            assert np.array_equal(np.sort(cosines), np.sort(rough)[-count:])
 
 
 @pytest.mark.usefixtures("few")
