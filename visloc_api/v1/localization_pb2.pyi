@@ -380,18 +380,26 @@ class HeightBand(_message.Message):
     MIN_FIELD_NUMBER: _builtins.int
     MAX_FIELD_NUMBER: _builtins.int
     min: _builtins.float
+    """Required. They have presence so that one that is left out is not read as 0."""
     max: _builtins.float
     def __init__(
         self,
         *,
-        min: _builtins.float = ...,
-        max: _builtins.float = ...,
+        min: _builtins.float | None = ...,
+        max: _builtins.float | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_max", b"_max", "_min", b"_min", "max", b"max", "min", b"min"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["max", b"max", "min", b"min"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_max", b"_max", "_min", b"_min", "max", b"max", "min", b"min"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    def WhichOneof(self, oneof_group: _Never) -> None: ...
+    _WhichOneofReturnType__max: _TypeAlias = _typing.Literal["max"]  # noqa: Y015
+    _WhichOneofArgType__max: _TypeAlias = _typing.Literal["_max", b"_max"]  # noqa: Y015
+    _WhichOneofReturnType__min: _TypeAlias = _typing.Literal["min"]  # noqa: Y015
+    _WhichOneofArgType__min: _TypeAlias = _typing.Literal["_min", b"_min"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__max) -> _WhichOneofReturnType__max | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__min) -> _WhichOneofReturnType__min | None: ...
 
 Global___HeightBand: _TypeAlias = HeightBand  # noqa: Y015
 
@@ -958,6 +966,7 @@ class Instant(_message.Message):
     ODOMETRY_FIELD_NUMBER: _builtins.int
     PRIORS_FIELD_NUMBER: _builtins.int
     timestamp: _builtins.int
+    """Required. It has presence so that one that is left out is not read as 0."""
     @_builtins.property
     def images(self) -> _containers.RepeatedCompositeFieldContainer[Global___RigImage]: ...
     @_builtins.property
@@ -969,16 +978,18 @@ class Instant(_message.Message):
     def __init__(
         self,
         *,
-        timestamp: _builtins.int = ...,
+        timestamp: _builtins.int | None = ...,
         images: _abc.Iterable[Global___RigImage] | None = ...,
         odometry: Global___Odometry | None = ...,
         priors: Global___Priors | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["odometry", b"odometry", "priors", b"priors"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_timestamp", b"_timestamp", "odometry", b"odometry", "priors", b"priors", "timestamp", b"timestamp"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["images", b"images", "odometry", b"odometry", "priors", b"priors", "timestamp", b"timestamp"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_timestamp", b"_timestamp", "images", b"images", "odometry", b"odometry", "priors", b"priors", "timestamp", b"timestamp"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    def WhichOneof(self, oneof_group: _Never) -> None: ...
+    _WhichOneofReturnType__timestamp: _TypeAlias = _typing.Literal["timestamp"]  # noqa: Y015
+    _WhichOneofArgType__timestamp: _TypeAlias = _typing.Literal["_timestamp", b"_timestamp"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__timestamp) -> _WhichOneofReturnType__timestamp | None: ...
 
 Global___Instant: _TypeAlias = Instant  # noqa: Y015
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from google.protobuf.descriptor import FieldDescriptor
 
 from service.api import jobs
 from service.api.answers import instant_answer
@@ -534,7 +535,9 @@ def test_instants_of_a_stream_say_the_same_as_json() -> None:
     start = pb2.SequenceStart(map="room", request_id="x")
     odometry = pb2.Odometry(rig_from_odometry=pb2.Transform(**IDENTITY))
     priors = pb2.Priors(gravity=pb2.GravityPrior(direction=[0, 1, 0]))
-    instant = pb2.Instant(images=[pb2.RigImage(image=b"")], odometry=odometry, priors=priors)
+    instant = pb2.Instant(
+        timestamp=0, images=[pb2.RigImage(image=b"")], odometry=odometry, priors=priors
+    )
 
     begun = sequence_start_of(pb2.LocalizeSequenceRequest(start=start))
     job = instant_of(pb2.LocalizeSequenceRequest(instant=instant), LIMITS, 0, has_rig=False)
@@ -569,19 +572,29 @@ def test_a_stream_begins_with_a_start(message: Any, got: str) -> None:
         (pb2.LocalizeSequenceRequest(), "sequence.message", None),
         (
             pb2.LocalizeSequenceRequest(
-                instant=pb2.Instant(images=[pb2.RigImage(sensor=str(i)) for i in range(3)])
+                instant=pb2.Instant(
+                    timestamp=1, images=[pb2.RigImage(sensor=str(i)) for i in range(3)]
+                )
             ),
             *("rig.too_many_images", "instants[4].images"),
         ),
         (
-            pb2.LocalizeSequenceRequest(instant=pb2.Instant(images=[pb2.RigImage(sensor="l")])),
+            pb2.LocalizeSequenceRequest(
+                instant=pb2.Instant(timestamp=1, images=[pb2.RigImage(sensor="l")])
+            ),
             *("request.query", "instants[4].images[0].image"),
         ),
         (
             pb2.LocalizeSequenceRequest(
-                instant=pb2.Instant(priors=pb2.Priors(height=pb2.HeightBand()))
+                instant=pb2.Instant(
+                    timestamp=1, priors=pb2.Priors(height=pb2.HeightBand(min=2, max=1))
+                )
             ),
             *("priors.height", "instants[4].priors.height"),
+        ),
+        (
+            pb2.LocalizeSequenceRequest(instant=pb2.Instant(images=[pb2.RigImage(image=b"")])),
+            *("request.missing_field", "instants[4].timestamp"),
         ),
     ],
 )
@@ -592,7 +605,7 @@ def test_a_wrong_message_of_a_stream_is_refused(message: Any, code: str, field: 
     assert field is None or caught.value.field == field
 
 
-# Places on Earth in messages of gRPC: 0 is a place, and what is left out is none.
+# Numbers in messages of gRPC: 0 is a place, a height and a time. A number that is left out is none.
 
 FIX = {"latitude": 0.0, "longitude": 0.0, "accuracy": 4.0}
 
@@ -625,6 +638,64 @@ def test_a_part_of_a_circle_that_is_left_out_is_named(left_out: str) -> None:
     with pytest.raises(InvalidInput) as caught:
         near_of(pb2.ListMapsRequest(near=pb2.Near(**parts)))
     assert (caught.value.code, caught.value.field) == ("request.missing_field", f"near.{left_out}")
+
+
+@pytest.mark.parametrize("left_out", ["min", "max"])
+def test_an_end_of_a_height_band_that_is_left_out_is_named(left_out: str) -> None:
+    band = {"min": -1.0, "max": 1.0}
+    del band[left_out]
+    priors = pb2.Priors(height=pb2.HeightBand(**band))
+    with pytest.raises(InvalidInput) as caught:
+        localize_job_of(pb2.LocalizeRequest(map="a", image=b"photo", priors=priors), 1000)
+    assert caught.value.code == "request.missing_field"
+    assert caught.value.field == f"priors.height.{left_out}"
+
+
+# Numbers of requests without presence, by what refuses their 0.
+REFUSED_AT_ZERO = {
+    "visloc.v1.Camera.width": ("camera.size", pb2.Camera(model="PINHOLE", height=48)),
+    "visloc.v1.Camera.height": ("camera.size", pb2.Camera(model="PINHOLE", width=64)),
+    "visloc.v1.PositionPrior.radius": (
+        "priors.position",
+        pb2.Priors(position=pb2.PositionPrior(position=[1, 2, 3])),
+    ),
+    "visloc.v1.LocalizeOptions.FusionWeightsEntry.value": (
+        "options.fusion_weights",
+        pb2.LocalizeOptions(fusion_weights={"densevlad": 0.0}),
+    ),
+}
+
+
+@pytest.mark.parametrize(("code", "part"), REFUSED_AT_ZERO.values(), ids=REFUSED_AT_ZERO)
+def test_a_number_without_presence_is_refused_at_zero(code: str, part: Any) -> None:
+    field = {pb2.Camera: "camera", pb2.Priors: "priors", pb2.LocalizeOptions: "options"}[type(part)]
+    if isinstance(part, pb2.Camera):
+        part.params.extend(CAMERA["params"])
+    request = pb2.LocalizeRequest(map="a", image=b"photo", **{field: part})
+    with pytest.raises(InvalidInput) as caught:
+        localize_job_of(request, 1000)
+    assert caught.value.code == code
+
+
+def test_all_other_numbers_of_requests_have_presence() -> None:
+    methods = [
+        method for service in pb2.DESCRIPTOR.services_by_name.values() for method in service.methods
+    ]
+    waiting = [method.input_type for method in methods]
+    messages = {}
+    while waiting:
+        message = waiting.pop()
+        if message.full_name not in messages:
+            messages[message.full_name] = message
+            waiting += [field.message_type for field in message.fields if field.message_type]
+    texts = {FieldDescriptor.CPPTYPE_STRING}  # an empty one names nothing
+    without = {
+        field.full_name
+        for message in messages.values()
+        for field in message.fields
+        if not (field.is_repeated or field.has_presence or field.cpp_type in texts)
+    }
+    assert without == set(REFUSED_AT_ZERO)
 
 
 def test_bytes_of_a_fix_are_what_they_were_before_its_parts_had_presence() -> None:
