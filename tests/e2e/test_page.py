@@ -339,7 +339,7 @@ def test_a_pose_is_shared_by_a_link_and_says_where_on_earth_it_is(
     assert opened["address"] == seen["link"]
     assert opened["map"]["version"] == answer["map"]["version"]
     assert f"{answer['pose']['position'][0]:.3f}" in opened["shown"]
-    assert "the camera of the last answer" in opened["described"]
+    assert "the camera of the link" in opened["described"]
     for name, there in seen["view"].items():
         assert opened["view"][name] == pytest.approx(there, abs=1e-4)
     assert "first.jpg" not in seen["link"]

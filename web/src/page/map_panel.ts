@@ -1,5 +1,5 @@
 // The tab "Map": what the map is, and how it is shown.
-import type { MapImages, MapInfo, PointBlock } from "visloc-client";
+import type { MapImages, MapInfo, PointBlock, Vector3 } from "visloc-client";
 import { element, facts, field } from "../dom";
 import { lengthText } from "../geometry";
 import { MAX_POINTS } from "../points";
@@ -23,6 +23,7 @@ export interface MapPanel {
 
 export function createMapPanel(host: HTMLElement, viewer: Viewer, theme: Theme): MapPanel {
   const about = element("div", { class: "stack" });
+  const numbers = element("div");
   const problems = element("div", { class: "stack" });
   const progress = element("p", { class: "quiet small number" });
   const camerasNote = element("p", { class: "quiet small" });
@@ -79,6 +80,12 @@ export function createMapPanel(host: HTMLElement, viewer: Viewer, theme: Theme):
     camerasNote,
   );
 
+  let shown: MapInfo | null = null;
+  /** How large the map is can be said only once its landmarks or cameras have come. */
+  const showFacts = (): void => {
+    if (shown !== null) numbers.replaceChildren(mapFacts(shown, viewer.extent));
+  };
+
   /** The button that had the focus, such as "Ask again", may be gone then: it stays in the tab. */
   function fill(content: Node): void {
     const focused = host.contains(document.activeElement);
@@ -90,10 +97,12 @@ export function createMapPanel(host: HTMLElement, viewer: Viewer, theme: Theme):
   return {
     showInstead: fill,
     showMap(map) {
+      shown = map;
+      numbers.replaceChildren(mapFacts(map, null));
       about.replaceChildren(
         element("h2", {}, map.id),
         element("p", {}, "Drop or paste a photo anywhere to see where it was taken."),
-        mapFacts(map),
+        numbers,
         element("p", { class: "quiet small", hidden: shownTiles(map) === "" }, shownTiles(map)),
         element(
           "p",
@@ -116,6 +125,7 @@ export function createMapPanel(host: HTMLElement, viewer: Viewer, theme: Theme):
       viewer.showMappingCameras(cameras.checked);
     },
     showBlock(block, loaded) {
+      if (block.first === 0) showFacts();
       if (!block.coloured && noColours.hidden) {
         noColours.hidden = false;
         photo.input.disabled = true;
@@ -131,6 +141,7 @@ export function createMapPanel(host: HTMLElement, viewer: Viewer, theme: Theme):
       say(progress, loaded < total ? sample : "");
     },
     showImages(images) {
+      showFacts();
       if (images.total > MAX_IMAGES) {
         say(camerasNote, `The first ${countText(images.images.length)} are shown.`);
       }
@@ -159,17 +170,17 @@ function paintLegend(scale: HTMLElement, theme: Theme): void {
   scale.style.backgroundImage = `linear-gradient(to right, ${PALETTES[theme].seenBy.join(", ")})`;
 }
 
-function mapFacts(map: MapInfo): HTMLElement {
-  const size = [0, 1, 2].map((axis) => (map.extent.max[axis] ?? 0) - (map.extent.min[axis] ?? 0));
+function mapFacts(map: MapInfo, extent: Vector3 | null): HTMLElement {
   const rows: [string, string][] = [
     ["Photos", countText(map.images)],
     ["Landmarks", countText(map.landmarks)],
   ];
   if (map.observations !== null) rows.push(["Observations", countText(map.observations)]);
   if (map.kind === "set") rows.unshift(["Maps in it", countText(map.tiles.length)]);
-  if (map.landmarks > 0 && size.every(Number.isFinite)) {
-    const sides = size.map((side) => lengthText(side, map.metric));
-    rows.push(["Extent", `${sides.join(" × ")}${map.metric ? "" : " (not metric)"}`]);
+  if (extent !== null) {
+    const sides = extent.map((side) => lengthText(side, map.metric)).join(" × ");
+    const name = shownTiles(map) === "" ? "Extent" : "Extent shown";
+    rows.push([name, `${sides}${map.metric ? "" : " (not metric)"}`]);
   }
   if (map.place !== null) {
     const { latitude, longitude } = map.place;

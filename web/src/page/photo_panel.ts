@@ -177,7 +177,7 @@ export function createPhotoPanel(host: HTMLElement, parts: PhotoPanelParts): Pho
       }),
     );
     if (!drawing) return;
-    drawn = here ? [pose.shown] : [];
+    drawn = here ? [{ ...pose.shown, fromLink: true }] : [];
     viewer.showPoses(drawn);
     viewer.highlight(new Set());
     photoView.hidden = !here;

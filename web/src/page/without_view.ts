@@ -13,6 +13,7 @@ export function withoutView(host: HTMLElement, why: string): Viewer {
     ...{ showPoses: nothing, setTrail: nothing, setCoverage: nothing },
     ...{ overview: nothing, flyTo: nothing, setTheme: nothing },
     statistics: { pointsLoaded: 0, pointsDrawn: 0, framesPerSecond: null, firstPictureMs: null },
+    extent: null,
     viewpoint: { position: [0, 0, 0], target: [0, 0, 0] },
     dispose: () => note.remove(),
   };

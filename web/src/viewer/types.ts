@@ -14,6 +14,8 @@ export interface ShownPose extends Frustum {
   positionCovariance?: number[];
   /** x, y, z of each inlier in the world, one after the other; a ray goes to each. */
   inliers?: ArrayLike<number>;
+  /** It came with a link, and is no answer. */
+  fromLink?: boolean;
 }
 
 /** One cell of the coverage: how likely a photo taken here, looking that way, is localized. */
@@ -58,6 +60,8 @@ export interface Viewer {
   flyTo(frustum: Frustum): void;
   setTheme(theme: Theme): void;
   readonly statistics: ViewerStatistics;
+  /** Width, depth and height of the map without its few outermost landmarks; null before any. */
+  readonly extent: Vector3 | null;
   /** Where the view looks from, in the world: for tests and links. */
   readonly viewpoint: { position: Vector3; target: Vector3 };
   dispose(): void;

@@ -183,7 +183,9 @@ export const createViewer: CreateViewer = (host: HTMLElement, theme: Theme): Vie
     const parts = [
       counted(cloud.loaded, "landmark"),
       ...(images.length > 0 ? [counted(images.length, "mapping photo")] : []),
-      ...(poses.length === 1 ? ["the camera of the last answer"] : []),
+      ...(poses.length === 1
+        ? [`the camera of the ${poses[0]?.fromLink ? "link" : "last answer"}`]
+        : []),
       ...(poses.length > 1 ? [`${poses.length} places that the last photo may be of`] : []),
       ...(coverage.length > 0 ? ["where a photo would be localized"] : []),
     ];
@@ -336,6 +338,11 @@ export const createViewer: CreateViewer = (host: HTMLElement, theme: Theme): Vie
         framesPerSecond: pace.framesPerSecond,
         firstPictureMs,
       };
+    },
+    get extent(): Vector3 | null {
+      if (extent === null) return null;
+      const { x, y, z } = extent.max.clone().sub(extent.min);
+      return [x, z, y];
     },
     get viewpoint() {
       return { position: toWorld(steering.camera.position), target: toWorld(steering.target) };
