@@ -305,7 +305,7 @@ class Engine:
         return await self.map(f"{map_id}@{version}")
 
     async def _try_out(self, version: MapFolder) -> None:
-        await self.workers.run(Vision.try_out, version)
+        await self.workers.run_again_if_killed(Vision.try_out, version)
 
     async def set_current(self, map_id: str, version: str) -> ServedMap:
         """Make a version current once a worker process has it open and warm.

@@ -1,8 +1,14 @@
 from __future__ import annotations
 
+import asyncio
+import os
+import signal
+
 import pytest
 
-from service.workers.pool import Turn, share_of_cores
+from service.values import WorkerSettings
+from service.workers.pool import Turn, _Worker, share_of_cores
+from visloc.errors import Unavailable
 
 
 @pytest.mark.parametrize(
@@ -36,3 +42,36 @@ def test_a_silent_stream_earns_no_right_to_overtake_all_others() -> None:
     silent.rank()
     silent.worked(3.0)
     assert waiting.rank() < silent.rank()
+
+
+def much(_: object) -> bytes:
+    """A task whose result takes a while to send."""
+    return bytes(2**28)
+
+
+def test_a_worker_that_is_killed_in_the_middle_of_its_answer_is_known_to_be_dead() -> None:
+    settings = WorkerSettings(
+        weights_dir=None,
+        threads=1,
+        max_loaded_bytes=2**30,
+        max_images=16,
+        max_instants=1000,
+        max_image_bytes=2**20,
+        max_image_pixels=10**6,
+    )
+
+    async def play() -> None:
+        worker = _Worker(settings)
+        await worker.start(())
+        asked = asyncio.create_task(worker.run(300.0, much, 1))
+        assert worker._connection is not None
+        while not worker._connection.poll(0):  # it begins to answer
+            await asyncio.sleep(0)
+        os.kill(worker.pid, signal.SIGKILL)
+        async with asyncio.timeout(20):
+            with pytest.raises(Unavailable) as caught:
+                await asked
+        assert caught.value.code == "server.worker_died"
+        await worker.stop()
+
+    asyncio.run(play())
