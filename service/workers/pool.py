@@ -349,7 +349,8 @@ class _Worker:
     @property
     def is_there(self) -> bool:
         """Whether the process lives now; ``alive`` learns of a death from the next task."""
-        return self._process is not None and self._process.is_alive()
+        started = self._process  # the thread may take it away meanwhile
+        return started is not None and started.is_alive()
 
     async def start(self, maps: Sequence[MapFolder]) -> None:
         """Start a process and open maps in it; it logs those that cannot be opened.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import shutil
 import signal
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from tests.service.engine.engines import (
     held_back,
     job_for,
     make,
+    publish,
     run,
     started,
     until,
@@ -191,6 +193,26 @@ def test_a_worker_that_died_idle_costs_no_request(
         assert (await engine.localize(job_for(query))).answer.pose is not None
 
     with started(built_maps) as with_engine:
+        with_engine(play)
+
+
+def test_a_photo_finds_the_successor_of_a_version_that_another_server_deleted(
+    maps_dir: Path, query: Query
+) -> None:
+    before = MapStore(maps_dir).folder("room")
+
+    async def play(engine: Engine) -> None:
+        with held_back(engine):
+            lost, waiting = (asyncio.create_task(engine.localize(job_for(query))) for _ in "ab")
+            await until(lambda: engine.workers.running == engine.workers.waiting == 1)
+            publish(maps_dir, "2")
+            shutil.rmtree(before)
+            os.kill(engine.workers.pids[0], signal.SIGKILL)
+            with pytest.raises(Unavailable):
+                await lost
+        assert (await waiting).map_version == "2"
+
+    with started(maps_dir) as with_engine:
         with_engine(play)
 
 
