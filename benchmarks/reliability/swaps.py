@@ -43,13 +43,12 @@ async def swaps(maps: SampleMaps, work: Path, seconds: float) -> list[Check]:
             asking = [
                 asyncio.create_task(ask_in_turn(each, cases, _CLIENTS, seconds)) for each in doors
             ]
-            harm = [
-                asyncio.create_task(_change(maps, doors, replicas, changes, faults, stop)),
-                asyncio.create_task(_kill(replicas, stop)),
-            ]
+            changing = asyncio.create_task(_change(maps, doors, replicas, changes, faults, stop))
+            killing = asyncio.create_task(_kill(replicas, stop))
             asked = [one.outcome for each in await asyncio.gather(*asking) for one in each]
             stop.set()
-            _, kills = await asyncio.gather(*harm)
+            await changing
+            kills = await killing
     versions = await asyncio.to_thread(verify_store, maps.folder)
     return _checks(asked, changes, faults, kills, versions, leftovers(maps.folder))
 

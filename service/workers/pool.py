@@ -56,9 +56,6 @@ _PING = methodcaller(str(Vision.ping))
 # Twice as many as there are sequences at once by default: all together then take at most half of a
 # worker from photos that wait.
 _SETBACK = 16.0
-# The longest time that a request may have been in the queue already, where its next task is queued.
-# A stream that was silent for an hour must not overtake all others for minutes.
-_MOST_CREDIT_S = 60.0
 
 
 @dataclass
@@ -68,21 +65,31 @@ class Turn:
     A sequence of a few photos takes a dozen tasks. If each queued behind all photos that came
     before it, a queue of five seconds would take a minute.
 
+    The time between two tasks does not count: streams that were silent, and then speak all at once,
+    must not overtake the photos that wait.
+
     Attributes:
-        since: when the request began, and later by what workers have spent on it.
+        since: when the request began, and later by the time between its tasks, and by what workers
+            have spent on them.
     """
 
     since: float = field(default_factory=monotonic)
+    _rested: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._rested = self.since
 
     def rank(self) -> float:
         """Return the rank of the next task: the least comes first, none is behind a new request."""
         now = monotonic()
-        self.since = max(self.since, now - _MOST_CREDIT_S)
+        self.since += now - self._rested
+        self._rested = now
         return min(now, self.since)
 
     def worked(self, seconds: float) -> None:
         """Let the request fall back by what a worker has spent on it."""
         self.since += _SETBACK * seconds
+        self._rested = monotonic()
 
 
 _turn: ContextVar[Turn | None] = ContextVar("turn", default=None)
