@@ -25,6 +25,7 @@ from benchmarks.reliability.load import RETRY_PAUSE_S, ask_in_turn, percentile
 from benchmarks.reliability.maps import SampleMaps, leftovers, verify_store
 from benchmarks.reliability.service_process import ServiceProcess
 from benchmarks.reliability.soak import Expected, unloaded_answers
+from benchmarks.reliability.swaps import told
 
 SHARE = 0.7  # of the capacity
 EVERY_S = 20.0  # swaps, kills, publications
@@ -58,6 +59,7 @@ class Happened:
     swaps: Counter[str] = field(default_factory=Counter)
     published: Counter[str] = field(default_factory=Counter)
     attacks: Counter[str] = field(default_factory=Counter)
+    faults: list[str] = field(default_factory=list)
     kills: int = 0
     replaced: int = 0
     memory: list[tuple[float, int]] = field(default_factory=list)
@@ -149,7 +151,7 @@ async def _harm(
             )
         )
         await asyncio.gather(
-            _change(maps, doors, happened, stop),
+            _change(maps, replicas, doors, happened, stop),
             _kill_workers(replicas, happened, stop),
             _replace(replicas[1], happened, stop, seconds / 2),
             _sample(replicas[0], happened, stop),
@@ -178,36 +180,49 @@ def _send_heavy(
 
 
 async def _change(
-    maps: SampleMaps, doors: Sequence[Doors], happened: Happened, stop: asyncio.Event
+    maps: SampleMaps,
+    replicas: Sequence[ServiceProcess],
+    doors: Sequence[Doors],
+    happened: Happened,
+    stop: asyncio.Event,
 ) -> None:
     """Swap the versions of all maps every 20 s, and publish one again; each until it is done."""
     packed, number = maps.packed.read_bytes(), 0
     first, last = maps.versions["room"]
     headers = {"Content-Type": "application/zip"}
 
+    async def change(method: str, path: str, **body: Any) -> str:
+        replica, response = await _until_done(doors, method, path, **body)
+        if response.status_code >= 500:
+            happened.faults.append(f"{method} {path}: {await told(response, replicas[replica])}")
+        return str(response.status_code)
+
     async def use(map_id: str, version: str) -> None:
         path, body = f"/maps/{map_id}/current", {"version": version}
-        happened.swaps[await _until_done(doors, "POST", path, json=body)] += 1
+        happened.swaps[await change("POST", path, json=body)] += 1
 
     while not await _stopped_within(stop, EVERY_S):
         number += 1
         await use("hall", maps.versions["hall"][number % 2])
         await use("room", first)
         path = f"/maps/room/versions/{last}"
-        await _until_done(doors, "DELETE", path)
-        added = await _until_done(doors, "PUT", path, content=packed, headers=headers)
+        await change("DELETE", path)
+        added = await change("PUT", path, content=packed, headers=headers)
         happened.published[added] += 1
         await use("room", last)
 
 
-async def _until_done(doors: Sequence[Doors], method: str, path: str, **body: Any) -> str:
+async def _until_done(
+    doors: Sequence[Doors], method: str, path: str, **body: Any
+) -> tuple[int, httpx.Response]:
+    """Ask the replicas in turn until one has room; return its number and its answer."""
     tries = 0
     while True:
         with suppress(httpx.TransportError):
-            each = doors[tries % len(doors)]
-            response = await each.http.request(method, path, **body)
+            replica = tries % len(doors)
+            response = await doors[replica].http.request(method, path, **body)
             if response.status_code not in (429, 503):
-                return str(response.status_code)
+                return replica, response
         tries += 1
         await asyncio.sleep(RETRY_PAUSE_S)
 
@@ -290,7 +305,8 @@ def _checks(
         Check(
             "no publication is lost or torn",
             f"published {counts_text(happened.published)}, swapped {counts_text(happened.swaps)}; "
-            f"{versions} versions read byte by byte; {len(left)} files left over",
+            f"{versions} versions read byte by byte; {len(left)} files left over"
+            + "".join(f"; {fault}" for fault in happened.faults),
             set(happened.published) <= {"201", "409"} and set(happened.swaps) == {"200"},
         ),
         Check(

@@ -380,7 +380,7 @@ class Catalog:
     async def _open(self, ref: str) -> MapFolder:
         """Open a version in one of the processes, and warm it up."""
         version = await self._prepare(ref)
-        await self._workers.run(Vision.load, version)
+        await self._workers.run_again_if_killed(Vision.load, version)
         return version
 
     async def _prepare(self, ref: str) -> MapFolder:

@@ -30,7 +30,7 @@ from service.workers.judging import gated, judged
 from service.workers.pool import Turn, Workers, using_turn
 from service.workers.tasks import Vision
 from visloc.archive import MapStore
-from visloc.errors import VislocError, refuse
+from visloc.errors import NotFound, VislocError, refuse
 from visloc.types import Near
 
 logger = logging.getLogger(__name__)
@@ -220,6 +220,17 @@ class Engine:
         return await self._search(job)
 
     async def _search(self, job: RigJob) -> Localization:
+        try:
+            return await self._search_once(job)
+        except NotFound as error:
+            named = not isinstance(job.maps, Near) and any("@" in ref for ref in job.maps)
+            if named or error.code != "map.version":
+                raise
+        # Another server deleted the version before a new process could open it: its successor is
+        # served by now, or soon.
+        return await self._search_once(job)
+
+    async def _search_once(self, job: RigJob) -> Localization:
         async with self._catalog.using(job.maps) as maps:
             sets, alone = parted(maps, job.priors)
             searches = [self._sets.localize(job, each) for each in sets]
@@ -305,7 +316,7 @@ class Engine:
         return await self.map(f"{map_id}@{version}")
 
     async def _try_out(self, version: MapFolder) -> None:
-        await self.workers.run(Vision.try_out, version)
+        await self.workers.run_again_if_killed(Vision.try_out, version)
 
     async def set_current(self, map_id: str, version: str) -> ServedMap:
         """Make a version current once a worker process has it open and warm.

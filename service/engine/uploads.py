@@ -59,7 +59,7 @@ class Uploads:
             InvalidInput: ``map.id``, ``packed.*``, and errors of ``verify_map``.
             StorageFull: ``maps.storage_full``.
             Forbidden: ``maps.read_only``.
-            Unavailable: ``server.worker_died`` when trying the map ended the process.
+            Unavailable: ``server.worker_died`` when trying the map ended two processes.
         """
         ref = f"{checked_name(map_id, 'map')}@{checked_name(version, 'map version')}"
         if version in await asyncio.to_thread(self._store.versions, map_id):

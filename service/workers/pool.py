@@ -3,38 +3,38 @@
 Tasks queue by request (``Turn``), not by the time at which they were queued.
 
 Native code can end a process without an exception; only the request in that process is lost. Each
-process has an executor of its own, because the standard one fails all its tasks when one process
-dies (docs/decisions/0013-worker-processes.md).
+process has a connection of its own, which ends with it, even in the middle of a message: the
+standard executor would wait for the rest for ever (docs/decisions/0013-worker-processes.md).
 """
 
 from __future__ import annotations
 
 import asyncio
-import concurrent.futures
+import atexit
 import ctypes
 import logging
-import os
-import signal
+import pickle
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from heapq import heapify, heappop, heappush
 from itertools import count as numbers
 from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from multiprocessing.context import ForkServerProcess
 from operator import methodcaller
 from time import monotonic
-from typing import Any, Concatenate, ParamSpec, TypeVar
+from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 
 from service.errors import stopping_error
 from service.machine import usable_cores
 from service.values import MapFolder, OpenMap, WorkerSettings
 from service.workers import process
 from service.workers.tasks import Vision
-from visloc.errors import VislocError, refuse
+from visloc.errors import Unavailable, VislocError, refuse
 
 logger = logging.getLogger(__name__)
 
@@ -56,9 +56,6 @@ _PING = methodcaller(str(Vision.ping))
 # Twice as many as there are sequences at once by default: all together then take at most half of a
 # worker from photos that wait.
 _SETBACK = 16.0
-# The longest time that a request may have been in the queue already, where its next task is queued.
-# A stream that was silent for an hour must not overtake all others for minutes.
-_MOST_CREDIT_S = 60.0
 
 
 @dataclass
@@ -68,21 +65,31 @@ class Turn:
     A sequence of a few photos takes a dozen tasks. If each queued behind all photos that came
     before it, a queue of five seconds would take a minute.
 
+    The time between two tasks does not count: streams that were silent, and then speak all at once,
+    must not overtake the photos that wait.
+
     Attributes:
-        since: when the request began, and later by what workers have spent on it.
+        since: when the request began, and later by the time between its tasks, and by what workers
+            have spent on them.
     """
 
     since: float = field(default_factory=monotonic)
+    _rested: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._rested = self.since
 
     def rank(self) -> float:
         """Return the rank of the next task: the least comes first, none is behind a new request."""
         now = monotonic()
-        self.since = max(self.since, now - _MOST_CREDIT_S)
+        self.since += now - self._rested
+        self._rested = now
         return min(now, self.since)
 
     def worked(self, seconds: float) -> None:
         """Let the request fall back by what a worker has spent on it."""
         self.since += _SETBACK * seconds
+        self._rested = monotonic()
 
 
 _turn: ContextVar[Turn | None] = ContextVar("turn", default=None)
@@ -210,6 +217,24 @@ class Workers:
             raise
         return result
 
+    async def run_again_if_killed(
+        self, method: Callable[Concatenate[Vision, P], T], *args: P.args, **kwargs: P.kwargs
+    ) -> T:
+        """Run a task that may be begun twice: if its process dies, once more in another.
+
+        Photos are not tried again: one that ended a process would end the next. Opening a map is,
+        because most processes die of something else, and operators rarely repeat a swap.
+
+        Raises:
+            VislocError: as ``run``; ``server.worker_died`` when both processes died.
+        """
+        try:
+            return await self.run(method, *args, **kwargs)
+        except Unavailable as error:
+            if error.code != "server.worker_died":
+                raise
+        return await self.run(method, *args, **kwargs)
+
     async def run_everywhere(
         self, method: Callable[Concatenate[Vision, P], T], *args: P.args, **kwargs: P.kwargs
     ) -> None:
@@ -238,7 +263,7 @@ class Workers:
         for queued in (*self._queue, *(each for one in self._workers for each in one.errands)):
             if not queued.answer.done():
                 queued.answer.set_exception(stopping_error())
-        await asyncio.gather(*(asyncio.to_thread(one.stop) for one in self._workers))
+        await asyncio.gather(*(one.stop() for one in self._workers))
 
     async def _serve(self, one: _Worker) -> None:
         """Give one process its tasks, and replace it when it dies."""
@@ -276,6 +301,8 @@ class Workers:
         try:
             async with asyncio.timeout(_WATCH_S), self._changed:
                 await self._changed.wait_for(lambda: one.errands or self._queue)
+                if not one.is_there:  # the task waits for its successor, or goes to another
+                    return None
                 return one.errands.popleft() if one.errands else heappop(self._queue)
         except TimeoutError:
             return None
@@ -304,7 +331,10 @@ def share_of_cores(cores: int, running: int, most: int) -> int:
 
 
 class _Worker:
-    """A worker process and its replacements."""
+    """A worker process and its replacements.
+
+    All that blocks happens in one thread of its own, so that one step begins after the other.
+    """
 
     def __init__(self, settings: WorkerSettings) -> None:
         self._settings = settings
@@ -314,12 +344,20 @@ class _Worker:
         self._context.set_forkserver_preload([FORK_SERVER])
         # Not an Event: its lock stays locked when a process is killed while it reads the event.
         self._abandoned = self._context.RawValue(ctypes.c_bool, False)
-        self._executor: ProcessPoolExecutor | None = None
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="worker")
+        self._process: ForkServerProcess | None = None
+        self._connection: Connection | None = None
         self.pid = 0
         self.alive = False
         self.busy = False
         self.open_maps: tuple[OpenMap, ...] = ()
         self.errands: deque[_Queued] = deque()
+
+    @property
+    def is_there(self) -> bool:
+        """Whether the process lives now; ``alive`` learns of a death from the next task."""
+        started = self._process  # the thread may take it away meanwhile
+        return started is not None and started.is_alive()
 
     async def start(self, maps: Sequence[MapFolder]) -> None:
         """Start a process and open maps in it; it logs those that cannot be opened.
@@ -327,26 +365,17 @@ class _Worker:
         Raises:
             Unavailable: ``server.worker_died``.
         """
-        await asyncio.to_thread(self.stop)
-        executor = ProcessPoolExecutor(
-            1,
-            mp_context=self._context,
-            initializer=process.start,
-            initargs=(self._settings, self._abandoned),
-        )
-        self._executor = executor
+        loop = asyncio.get_running_loop()
+        self._kill()
         self._abandoned.value = False
         self.pid, self.alive = 0, True
         try:
-            # In a thread: the first process waits for the fork server, which loads libraries first.
-            first = await asyncio.to_thread(
-                executor.submit, process.run, _PING, self._settings.threads
-            )
+            # The first process waits for the fork server, which loads libraries first.
+            self.pid = await loop.run_in_executor(self._thread, self._begin)
         except (OSError, EOFError) as error:  # no memory or file descriptors for a process
             self.alive = False
             logger.error("no process can be started: %s", error)  # noqa: TRY400
             raise _died() from None
-        self.pid = await self._answer_of(first, _START_LIMIT_S)
         warm = methodcaller(str(Vision.warm), tuple(maps))
         await self._call(_START_LIMIT_S, warm, self._settings.threads)
 
@@ -369,51 +398,82 @@ class _Worker:
         if self.busy:
             self._abandoned.value = True
 
-    def stop(self) -> None:
+    async def stop(self) -> None:
         """End the process, even if it hangs."""
-        if self.alive:
-            self._kill()
-        if self._executor is not None:
-            self._executor.shutdown(wait=True, cancel_futures=True)
-            self._executor = None
+        self._kill()
+        await asyncio.get_running_loop().run_in_executor(self._thread, self._end)
+        self._thread.shutdown()
 
     async def _call(self, limit_s: float, task: Task[T], threads: int) -> T:
-        if self._executor is None or not self.alive:
+        loop = asyncio.get_running_loop()
+        asked = loop.run_in_executor(self._thread, self._ask, task, threads)
+        done, _ = await asyncio.wait({asked}, timeout=limit_s)
+        if not done:
+            self._kill()
+            await asyncio.wait({asked})  # the end of the process ends the connection
+            with suppress(Exception):
+                asked.result()
+            raise refuse(
+                "server.deadline",
+                "the request took too long; ask for less, or raise request_timeout_s",
+                expected=f"at most {limit_s:g} s",
+            )
+        reply = asked.result()
+        if reply is None:
+            self.alive = False
             raise _died()
-        try:
-            future = self._executor.submit(process.run, task, threads)
-        except BrokenProcessPool:
-            self.alive = False
-            raise _died() from None
-        return await self._answer_of(future, limit_s)
+        result, self.open_maps = reply.opened()
+        return cast(T, result)
 
-    async def _answer_of(
-        self, running: concurrent.futures.Future[tuple[T, tuple[OpenMap, ...]]], limit_s: float
-    ) -> T:
+    def _begin(self) -> int:
+        """Start a process in place of the one before; in the thread."""
+        self._end()
+        ours, theirs = self._context.Pipe()
+        started = self._context.Process(
+            target=process.serve, args=(theirs, self._settings, self._abandoned)
+        )
         try:
-            future = asyncio.wrap_future(running)
-            done, _ = await asyncio.wait({future}, timeout=limit_s)
-            if not done:
-                self._kill()
-                await asyncio.wait({future})
-                with suppress(BrokenProcessPool):
-                    future.result()
-                raise refuse(
-                    "server.deadline",
-                    "the request took too long; ask for less, or raise request_timeout_s",
-                    expected=f"at most {limit_s:g} s",
-                )
-            result, self.open_maps = future.result()
-        except BrokenProcessPool:
-            self.alive = False
-            raise _died() from None
-        return result
+            started.start()
+        except BaseException:
+            ours.close()
+            raise
+        finally:
+            theirs.close()  # so that the end of the process is the end of the connection
+        atexit.register(ours.close)  # an idle process ends with its connection
+        self._process, self._connection = started, ours
+        assert started.pid is not None
+        return started.pid
+
+    def _ask(self, task: Task[Any], threads: int) -> process.Reply | None:
+        """Let the process do a task; None if it died; in the thread."""
+        message = pickle.dumps((task, threads), pickle.HIGHEST_PROTOCOL)
+        try:
+            assert self._connection is not None  # started
+            self._connection.send_bytes(message)
+            reply = self._connection.recv_bytes()
+        except (EOFError, OSError):
+            return None
+        found = pickle.loads(reply)
+        assert isinstance(found, process.Reply)
+        return found
+
+    def _end(self) -> None:
+        """Wait for the end of a killed process; in the thread."""
+        ended, connection = self._process, self._connection
+        self._process = self._connection = None
+        if ended is None or connection is None:
+            return
+        ended.kill()  # one that began while it was to be stopped
+        ended.join()
+        ended.close()
+        atexit.unregister(connection.close)
+        connection.close()
 
     def _kill(self) -> None:
         self.alive = False
-        if self.pid:
-            with suppress(ProcessLookupError):
-                os.kill(self.pid, signal.SIGKILL)
+        started = self._process
+        if started is not None and started.is_alive():
+            started.kill()
 
 
 def _died() -> VislocError:

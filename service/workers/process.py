@@ -1,32 +1,61 @@
-"""The entry points of a worker process: started once, then one task after another."""
+"""The main function of a worker process: one task after another."""
 
 from __future__ import annotations
 
 import ctypes
 import os
+import pickle
 import signal
 import threading
-from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
 from multiprocessing import parent_process
-from typing import TYPE_CHECKING, TypeVar
+from multiprocessing.connection import Connection
+from traceback import format_exception
+from typing import TYPE_CHECKING, Any
 
 from service.values import OpenMap, WorkerSettings
 
 if TYPE_CHECKING:
     from service.workers.vision import Vision
 
-T = TypeVar("T")
 
-_vision: Vision | None = None
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """What became of a task.
+
+    Attributes:
+        result: of the task.
+        open_maps: the maps that are open after it.
+        error: what it raised.
+        traceback: of the error, as text; frames cannot be sent.
+    """
+
+    result: Any = None
+    open_maps: tuple[OpenMap, ...] = ()
+    error: BaseException | None = None
+    traceback: str = ""
+
+    def opened(self) -> tuple[Any, tuple[OpenMap, ...]]:
+        """Return the result and the open maps, or raise the error."""
+        if self.error is not None:
+            raise self.error from TracebackInWorker(self.traceback)
+        return self.result, self.open_maps
 
 
-def start(settings: WorkerSettings, abandoned: ctypes.c_bool) -> None:
-    """Initialize the process.
+class TracebackInWorker(Exception):
+    """The cause of an error that a task raised; the log shows it."""
+
+    def __str__(self) -> str:
+        return f"\n{self.args[0]}"
+
+
+def serve(connection: Connection, settings: WorkerSettings, abandoned: ctypes.c_bool) -> None:
+    """Do one task after another, until the main process closes its end of the connection.
 
     Args:
         abandoned: shared with the main process, which sets it when nobody waits for the task.
     """
-    global _vision
     # Both may reach all processes of a group, and the main process decides when to end.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
@@ -35,7 +64,21 @@ def start(settings: WorkerSettings, abandoned: ctypes.c_bool) -> None:
         settings.configure_logging()
     from service.workers.vision import Vision  # not in the main process, which has this module too
 
-    _vision = Vision(settings, abandoned)
+    vision = Vision(settings, abandoned)
+    with suppress(EOFError, OSError):  # of the connection
+        while True:
+            connection.send_bytes(_reply_to(connection.recv_bytes(), vision))
+
+
+def _reply_to(message: bytes, vision: Vision) -> bytes:
+    try:
+        task, threads = pickle.loads(message)
+        vision.use_threads(threads)
+        reply = Reply(task(vision), vision.open_maps)
+        return pickle.dumps(reply, pickle.HIGHEST_PROTOCOL)
+    except BaseException as error:  # noqa: BLE001  whatever it is, the main process gets it
+        text = "".join(format_exception(error))
+        return pickle.dumps(Reply(error=error, traceback=text), pickle.HIGHEST_PROTOCOL)
 
 
 def _end_with_parent() -> None:
@@ -44,10 +87,3 @@ def _end_with_parent() -> None:
     if parent is not None:
         parent.join()
     os._exit(1)
-
-
-def run(task: Callable[[Vision], T], threads: int) -> tuple[T, tuple[OpenMap, ...]]:
-    """Return a task's result, and the maps that are open after it."""
-    assert _vision is not None  # start ran
-    _vision.use_threads(threads)
-    return task(_vision), _vision.open_maps

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import shutil
 import signal
 from pathlib import Path
 
@@ -11,8 +12,19 @@ import numpy as np
 import pytest
 
 from service.engine.engine import Engine
+from service.workers import pool
 from service.workers.tasks import Vision
-from tests.service.engine.engines import Query, WithEngine, held_back, job_for, make, run, until
+from tests.service.engine.engines import (
+    Query,
+    WithEngine,
+    held_back,
+    job_for,
+    make,
+    publish,
+    run,
+    started,
+    until,
+)
 from visloc.archive import MapStore
 from visloc.errors import InvalidInput, NotFound, Overloaded, TimedOut, Unavailable
 
@@ -149,6 +161,59 @@ def test_a_worker_that_dies_fails_its_own_request_and_is_replaced(
         assert engine.status.ready
 
     with_two_workers(play)
+
+
+def test_a_swap_whose_worker_is_killed_goes_on_in_another(
+    maps_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pool, "_WATCH_S", 60.0)  # so that only the swap runs
+    version = MapStore(maps_dir).current_version("room")
+
+    async def play(engine: Engine) -> None:
+        (pid,) = engine.workers.pids
+        with held_back(engine):
+            swapping = asyncio.create_task(engine.set_current("room", version))
+            await until(lambda: engine.workers.running == 1)
+            os.kill(pid, signal.SIGKILL)
+            assert (await swapping).outline.manifest.version == version
+
+    with started(maps_dir) as with_engine:
+        with_engine(play)
+
+
+def test_a_worker_that_died_idle_costs_no_request(
+    built_maps: Path, query: Query, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pool, "_WATCH_S", 60.0)  # so that nobody notices before the photo comes
+
+    async def play(engine: Engine) -> None:
+        (pid,) = engine.workers.pids
+        os.kill(pid, signal.SIGKILL)
+        await until(lambda: not Path(f"/proc/{pid}").exists())
+        assert (await engine.localize(job_for(query))).answer.pose is not None
+
+    with started(built_maps) as with_engine:
+        with_engine(play)
+
+
+def test_a_photo_finds_the_successor_of_a_version_that_another_server_deleted(
+    maps_dir: Path, query: Query
+) -> None:
+    before = MapStore(maps_dir).folder("room")
+
+    async def play(engine: Engine) -> None:
+        with held_back(engine):
+            lost, waiting = (asyncio.create_task(engine.localize(job_for(query))) for _ in "ab")
+            await until(lambda: engine.workers.running == engine.workers.waiting == 1)
+            publish(maps_dir, "2")
+            shutil.rmtree(before)
+            os.kill(engine.workers.pids[0], signal.SIGKILL)
+            with pytest.raises(Unavailable):
+                await lost
+        assert (await waiting).map_version == "2"
+
+    with started(maps_dir) as with_engine:
+        with_engine(play)
 
 
 def test_an_idle_worker_that_dies_is_replaced(with_engine: WithEngine, query: Query) -> None:
