@@ -139,8 +139,8 @@ class InvertedFile:
             best = largest(cosines, count)
             rows, cosines = rows[best], cosines[best]
             least = float(cosines.min()) if len(best) == count else -np.inf
-            others = self.rough_cosines(query, lists[end:], allowed, least)
-            rows, cosines = (np.concatenate(a) for a in zip((rows, cosines), others, strict=True))
+            others, theirs = self.rough_cosines(query, lists[end:], allowed, least)
+            rows, cosines = np.concatenate([rows, others]), np.concatenate([cosines, theirs])
         best = largest(cosines, count)
         return rows[best], cosines[best]
 
