@@ -1,6 +1,6 @@
 """Progress of a long command: bars on a terminal, lines in a log.
 
-A log gets a line at the end of each stage, and every ten seconds.
+A log gets a line at the end of each stage, and every five seconds.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from rich.progress import (
 )
 
 # Time between two lines in a log.
-_LINE_EVERY_S = 10.0
+_LINE_EVERY_S = 5.0
 
 
 class StageProgress:

@@ -15,6 +15,7 @@ import pytest
 
 from mapping.methods.matching.stages import Matches
 from mapping.methods.sparse import adjustment
+from mapping.methods.sparse.adjustment import adjusted_robustly
 from mapping.methods.sparse.colmap_scene import colmap_database
 from mapping.methods.sparse.incremental import largest_model
 from mapping.methods.sparse.triangulation import pipeline_options
@@ -86,6 +87,28 @@ def test_large_models_are_told_more_often_and_come_out_alike(
     assert found["few"].keys() == found["many"].keys()
     for name, center in found["many"].items():
         np.testing.assert_allclose(found["few"][name], center, atol=1e-4)
+
+
+@pytest.mark.parametrize("steps", [1, 2, 3, 8])
+def test_adjustments_of_few_steps_at_once_do_not_repeat_steps_that_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, steps: int
+) -> None:
+    """They end before the limit of 100 steps, where all steps at once end."""
+    with prepared(make_world(PHOTOS, noise_px=0.5), tmp_path) as (path, options):
+        model = largest_model(path, options, lambda *_: None)
+    assert model is not None
+    rng = np.random.default_rng(1)
+    for point in model.points3D.values():
+        point.xyz += rng.normal(0, 3.0, 3)  # so far off that some steps fail
+    told: Told = []
+    errors = {}
+    for at_once in (100, steps):
+        monkeypatch.setattr(adjustment, "_STEPS", at_once)
+        told.clear()
+        adjusted = adjusted_robustly(model, set(), lambda *now: told.append(now))
+        errors[at_once] = adjusted.compute_mean_reprojection_error()
+    assert errors[steps] == pytest.approx(errors[100], rel=1e-3)
+    assert steps * len(told) < 90
 
 
 @pytest.mark.usefixtures("interruptible")
