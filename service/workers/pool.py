@@ -270,8 +270,7 @@ class Workers:
         while True:
             queued = await self._next(one)
             if queued is None:  # idle for a while: is it still there?
-                with suppress(VislocError):
-                    await one.run(self._limit_s, _PING, self._most_threads)
+                await one.ping(self._limit_s)
             elif not queued.answer.done():
                 await self._work_on(one, queued)
             if not one.alive:
@@ -392,6 +391,11 @@ class _Worker:
             return await self._call(limit_s, task, threads)
         finally:
             self.busy = False
+
+    async def ping(self, limit_s: float) -> None:
+        """Find out whether the process answers; it does not count as busy meanwhile."""
+        with suppress(VislocError):
+            await self._call(limit_s, _PING, self._settings.threads)
 
     def abandon(self) -> None:
         """Tell the process that nobody waits for its task."""
