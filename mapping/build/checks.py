@@ -34,7 +34,7 @@ def check_settings(settings: BuildSettings) -> None:
 
     Raises:
         InvalidInput: ``build.*``, with the option that is wrong.
-        WeightsError: for a network whose weights are missing.
+        WeightsError: for a global descriptor whose weights are missing.
     """
     if settings.method not in METHODS:
         raise refuse("build.method", field="--method", expected=METHODS, got=settings.method)

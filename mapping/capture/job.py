@@ -26,11 +26,13 @@ from mapping.importers import ImportedModel, write_imported
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.pairing import PairSettings
 from mapping.progress import Progress
+from mapping.stages.networks import Networks
 from mapping.stages.photos import collect_photos
 from mapping.stages.work_folder import WorkFolder, exclusive
 from visloc.archive import MapStore
 from visloc.errors import VislocError, refuse
 from visloc.kapture import read_dataset
+from visloc.options import Inference
 
 # Rough: 14 photos of 1600 x 900 took five seconds of one core each, smaller ones less; incremental
 # mapping grows faster than their number. Bytes are of the work folder, and of memory.
@@ -113,12 +115,15 @@ def capture_map(
         Unavailable: ``storage.failed`` when the disk is full or broken.
         NotFound, InvalidInput: ``capture.*`` for sources and lengths that cannot be used; what
             importers and builds raise.
+        WeightsError: for a network whose weights are missing; nothing was read yet.
     """
     length, marker_m = settings.known_length, settings.marker_m
     if length is not None and marker_m is not None:
         raise refuse("capture.two_scales", field="--marker-size")
     store = MapStore(settings.maps_dir)
     sources = find_sources(settings.sources)
+    networks = Networks(settings.weights_dir, Inference.AUTO)
+    networks.open(settings.local_features, settings.global_features)
     # Ids begin with a letter or digit: no work folder of a build has this name.
     root = settings.maps_dir / ".work" / f".capture-{settings.map_id}"
     with _told_of_the_disk(root), exclusive(root.with_name(f"{root.name}.lock")):

@@ -4,6 +4,7 @@ import os
 import resource
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from mapping.capture.job import capture_map
 from mapping.capture.settings import CaptureSettings
 from tests.mapping.capture.conftest import panned, texture
 from visloc.archive import MapStore
-from visloc.errors import Conflict, InvalidInput, Unavailable
+from visloc.errors import Conflict, InvalidInput, Unavailable, WeightsError
 from visloc.kapture import read_dataset
 
 
@@ -101,6 +102,19 @@ def test_photos_that_do_not_join_are_refused_with_what_to_film_and_what_was_left
     assert "overlaps the next" in str(refused.value)
     assert "--pairs" not in str(refused.value)
     assert any("broken.jpg" in note for note in refused.value.__notes__)
+
+
+@pytest.mark.parametrize("missing", ["local_features", "global_features"])
+def test_missing_weights_are_refused_before_anything_is_read(
+    make_video: Callable[..., Path], tmp_path: Path, missing: str
+) -> None:
+    maps = tmp_path / "maps"
+    settings = CaptureSettings([make_video(panned(20, 12))], "room", maps)
+    without = {"local_features": "r2d2", "global_features": ("netvlad",)}
+    with pytest.raises(WeightsError) as refused:
+        capture_map(replace(settings, **{missing: without[missing]}), quiet, quiet)
+    assert refused.value.code == "weights.missing"
+    assert not maps.exists()
 
 
 def test_an_id_without_room_for_pieces_is_refused_before_the_long_work(
