@@ -29,15 +29,10 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 
-import cv2
 import numpy as np
 import typer
 from typer.core import TyperGroup
 
-from samples.film import film_walk
-from samples.render import render_photo
-from samples.scene import make_room
-from samples.trajectories import mapping_trajectory, stereo_rig
 from tests.rosbags_made import write_bag
 from visloc.kapture import read_dataset
 
@@ -476,19 +471,8 @@ def prepare(base: Path) -> None:
         copy_renamed(base / "small" / "mapping", base / "small" / name)
     call(base, ["mapping", "build", "small/mapping", "--map", "kitchen"])
     call(base, ["mapping", "build", "small/query", "--map", "hall", "--method", "sfm"])
-    film_ten_seconds(base)
+    call(base, [sys.executable, str(ROOT / "examples" / "film.py")])
     write_bag(base / "walk.bag", read_dataset(base / "small" / "mapping"), ros1=True)
-
-
-def film_ten_seconds(folder: Path) -> None:
-    """Make ``walk.mp4``, a clip of a walk through the sample's room, and ``photo.jpg`` of it."""
-    rig = stereo_rig(320, 240)["left"]
-    # A third of the loop through the room.
-    poses = [rig.cam_from_rig @ pose for pose in mapping_trajectory(150)[:50]]
-    scene = make_room(0)
-    film_walk(folder / "walk.mp4", scene, rig.camera, poses, rate=5)
-    photo = render_photo(scene, rig.camera, poses[12], np.random.default_rng(1))
-    cv2.imwrite(str(folder / "photo.jpg"), cv2.cvtColor(photo, cv2.COLOR_RGB2BGR))
 
 
 def copy_renamed(source: Path, target: Path) -> None:

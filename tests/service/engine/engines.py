@@ -7,14 +7,15 @@ import json
 import os
 import shutil
 import signal
-from collections.abc import Callable, Coroutine, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+from contextlib import asynccontextmanager, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from service.engine.engine import Engine
 from service.telemetry.metrics import Metrics
 from service.values import RigJob, WorkerSettings, photo_job
+from service.workers.tasks import Vision
 from visloc.archive import MapStore
 from visloc.geometry import Camera
 from visloc.images import ImageLimits
@@ -52,9 +53,11 @@ async def until(happened: Callable[[], bool], seconds: float = 20.0) -> None:
             await asyncio.sleep(0.02)
 
 
-@contextmanager
-def held_back(engine: Engine) -> Iterator[None]:
+@asynccontextmanager
+async def held_back(engine: Engine) -> AsyncIterator[None]:
     """Stop the worker processes for a while, as a busy machine does."""
+    # Each has just answered, so none is being pinged, and the next task is the next it takes.
+    await engine.workers.run_everywhere(Vision.ping)
     pids = engine.workers.pids
     try:
         for pid in pids:

@@ -77,7 +77,7 @@ def test_a_version_that_another_server_replaced_and_deleted_gives_way_to_its_suc
         engine = make(maps_dir)
         await engine.start()
         old = (await engine.localize(job_for(query))).map_version
-        with held_back(engine):  # so that it cannot open the new version yet
+        async with held_back(engine):  # so that it cannot open the new version yet
             publish(maps_dir, "v2")
             MapStore(maps_dir).remove("room", old)
             asking = asyncio.create_task(engine.localize(job_for(query)))
@@ -327,7 +327,7 @@ def test_a_version_is_deleted_after_the_requests_that_began_with_it(
     publish(maps_dir, "v2")
 
     async def play(engine: Engine) -> None:
-        with held_back(engine):
+        async with held_back(engine):
             asked = asyncio.create_task(engine.localize(job_for(query, f"room@{old}")))
             await until(lambda: engine.workers.running == 1)
             deleting = asyncio.create_task(engine.delete("room", old))

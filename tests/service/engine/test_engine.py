@@ -72,7 +72,7 @@ def test_a_map_that_is_not_there_is_refused(
 
 def test_one_photo_too_many_is_refused_at_once(with_engine: WithEngine, query: Query) -> None:
     async def play(engine: Engine) -> None:
-        with held_back(engine):
+        async with held_back(engine):
             accepted = [asyncio.create_task(engine.localize(job_for(query))) for _ in range(3)]
             await asyncio.sleep(0.1)
             with pytest.raises(Overloaded) as caught:
@@ -92,7 +92,7 @@ def test_a_photo_whose_caller_left_is_dropped_and_gives_back_its_place(
     with_engine: WithEngine, query: Query
 ) -> None:
     async def play(engine: Engine) -> None:
-        with held_back(engine):
+        async with held_back(engine):
             running = asyncio.create_task(engine.localize(job_for(query)))
             await until(lambda: engine.workers.running == 1)
             leaves, stays = (asyncio.create_task(engine.localize(job_for(query))) for _ in range(2))
@@ -112,7 +112,7 @@ def test_a_photo_that_is_worked_on_is_given_up_when_its_caller_leaves(
     with_engine: WithEngine, query: Query
 ) -> None:
     async def play(engine: Engine) -> None:
-        with held_back(engine):
+        async with held_back(engine):
             task = asyncio.create_task(engine.localize(job_for(query)))
             await until(lambda: engine.workers.running == 1)
             task.cancel()
@@ -127,7 +127,7 @@ def test_a_photo_that_is_worked_on_is_given_up_when_its_caller_leaves(
 
 def test_workers_work_at_the_same_time(with_two_workers: WithEngine, query: Query) -> None:
     async def play(engine: Engine) -> None:
-        with held_back(engine):
+        async with held_back(engine):
             tasks = [asyncio.create_task(engine.localize(job_for(query))) for _ in range(2)]
             await until(lambda: engine.workers.running == 2)
         await asyncio.gather(*tasks)
@@ -141,7 +141,7 @@ def test_a_worker_that_dies_fails_its_own_request_and_is_replaced(
     async def play(engine: Engine) -> None:
         one, other = engine.workers.pids
         alone = await engine.localize(job_for(query))
-        with held_back(engine):
+        async with held_back(engine):
             tasks = [asyncio.create_task(engine.localize(job_for(query))) for _ in range(4)]
             await until(lambda: engine.workers.running == 2)
             os.kill(one, signal.SIGKILL)
@@ -171,7 +171,7 @@ def test_a_swap_whose_worker_is_killed_goes_on_in_another(
 
     async def play(engine: Engine) -> None:
         (pid,) = engine.workers.pids
-        with held_back(engine):
+        async with held_back(engine):
             swapping = asyncio.create_task(engine.set_current("room", version))
             await until(lambda: engine.workers.running == 1)
             os.kill(pid, signal.SIGKILL)
@@ -202,7 +202,7 @@ def test_a_photo_finds_the_successor_of_a_version_that_another_server_deleted(
     before = MapStore(maps_dir).folder("room")
 
     async def play(engine: Engine) -> None:
-        with held_back(engine):
+        async with held_back(engine):
             lost, waiting = (asyncio.create_task(engine.localize(job_for(query))) for _ in "ab")
             await until(lambda: engine.workers.running == engine.workers.waiting == 1)
             publish(maps_dir, "2")

@@ -462,7 +462,7 @@ def test_a_sequence_that_is_given_up_frees_everything(
             with engine.admit_batch():
                 await answers_of(engine, START, instants)
 
-        with held_back(engine):
+        async with held_back(engine):
             asking = asyncio.create_task(ask())
             await until(lambda: engine.workers.running == 1)
             with pytest.raises(Overloaded), engine.admit_batch():
