@@ -203,8 +203,10 @@ def test_a_photo_finds_the_successor_of_a_version_that_another_server_deleted(
 
     async def play(engine: Engine) -> None:
         async with held_back(engine):
-            lost, waiting = (asyncio.create_task(engine.localize(job_for(query))) for _ in "ab")
-            await until(lambda: engine.workers.running == engine.workers.waiting == 1)
+            lost = asyncio.create_task(engine.localize(job_for(query)))
+            await until(lambda: engine.workers.running == 1)
+            waiting = asyncio.create_task(engine.localize(job_for(query)))
+            await until(lambda: engine.workers.waiting == 1)
             publish(maps_dir, "2")
             shutil.rmtree(before)
             os.kill(engine.workers.pids[0], signal.SIGKILL)
