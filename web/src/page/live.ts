@@ -44,7 +44,7 @@ export interface Live {
 
 const ANNOUNCE_EVERY_MS = 5000;
 
-// Of the map's diagonal: what nobody sees as a step.
+// Of the diagonal of what the view shows of the map: what nobody sees as a step.
 const STEP_SHARE = 1 / 2000;
 
 /** Fill the tab; nothing asks for the camera before it is started. */
@@ -56,7 +56,7 @@ export function createLive(host: HTMLElement, context: PageContext): Live {
   const figures = new LiveFigures();
   const prior = new WalkingPrior();
   const estimates = new FocalEstimates();
-  const trail = new Trail(() => STEP_SHARE * diagonal(context.map()));
+  const trail = new Trail(() => STEP_SHARE * Math.hypot(...(context.viewer.extent ?? [])));
   let last: LocalizeResponse | null = null;
   let failing = false;
   let announced = { outcome: "", at: -Infinity };
@@ -311,11 +311,4 @@ function answerInWords(
   const earth =
     geopose === null ? "" : ` On Earth ${positionText(geopose)}, heading ${headingText(geopose)}.`;
   return `± ${std}${alone}; ${agree}${sure}${earth}`;
-}
-
-/** Of the box around the map's landmarks. */
-function diagonal(map: MapInfo | null): number {
-  if (map === null) return 0;
-  const { min, max } = map.extent;
-  return Math.hypot(...max.map((end, axis) => end - (min[axis] ?? end)));
 }
