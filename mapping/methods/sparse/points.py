@@ -9,7 +9,6 @@ observations changed: three quarters of the time of later rounds went into point
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
@@ -33,20 +32,26 @@ def triangulate_points(
         model: changed in place.
         path: of the database with the matches.
         progress: called with how much is done, in photos: each is counted once when its matches
-            are triangulated, and once in each round of adjustment.
+            are triangulated, once in each adjustment, and once after each of these, when tracks
+            are completed and merged.
     """
     images = sorted(model.reg_image_ids())
     rounds = options.ba_global_max_refinements
-    total = len(images) * (1 + rounds)
-    progress(0, total)
+    total = 2 * len(images) * (1 + rounds)
+
+    def tell(passes: float) -> None:
+        # Never all: rounds may follow.
+        progress(min(int(len(images) * passes), total - 1), total)
+
+    tell(0)
     with pycolmap.Database.open(path) as database:
         cache = pycolmap.DatabaseCache.create(database, cache_options(options))
     mapper = pycolmap.IncrementalMapper(cache)
     mapper.begin_reconstruction(model)
     for done, image_id in enumerate(images, 1):
         mapper.triangulate_image(options.triangulation, image_id)
-        progress(done, total)
-    _complete_and_merge(mapper, options, partial(progress, len(images), total))
+        tell(done / len(images))
+    _complete_and_merge(mapper, options, tell, 1)
     adjusted: dict[int, int] = {}
     for number in range(1, rounds + 1):
         mapper.observation_manager.filter_observations_with_negative_depth()
@@ -62,11 +67,8 @@ def triangulate_points(
         mapper.clear_modified_points3D()
         for start in range(0, len(points), _BATCH):
             _adjust(model, points[start : start + _BATCH], options)
-            share = min(start + _BATCH, len(points)) / len(points)
-            # Never all: the last of these rounds is not yet the end.
-            progress(min(int(len(images) * (number + share)), total - 1), total)
-        done = min(len(images) * (number + 1), total - 1)
-        changed = _complete_and_merge(mapper, options, partial(progress, done, total))
+            tell(2 * number + min(start + _BATCH, len(points)) / len(points))
+        changed = _complete_and_merge(mapper, options, tell, 2 * number + 1)
         changed += mapper.filter_points(options.mapper)
         if changed <= options.ba_global_max_refinement_change * observations:
             break
@@ -77,19 +79,24 @@ def triangulate_points(
 def _complete_and_merge(
     mapper: pycolmap.IncrementalMapper,
     options: pycolmap.IncrementalPipelineOptions,
-    still_here: Callable[[], None],
+    tell: Callable[[float], None],
+    passes: int,
 ) -> int:
     """Complete and merge the tracks of all points; return how many observations changed.
+
+    It tells how many passes over all photos are done, beginning with ``passes``.
 
     ``mapper.complete_and_merge_tracks`` does so in one call, which lets neither progress nor Ctrl-C
     through: with 300 photos on a busy machine for at most 30 seconds.
     """
     changed = 0
-    for step in (mapper.triangulator.complete_tracks, mapper.triangulator.merge_tracks):
+    steps = (mapper.triangulator.complete_tracks, mapper.triangulator.merge_tracks)
+    for number, step in enumerate(steps):
         points = sorted(mapper.reconstruction.point3D_ids())
         for start in range(0, len(points), _BATCH):
             changed += step(options.triangulation, set(points[start : start + _BATCH]))
-            still_here()
+            share = min(start + _BATCH, len(points)) / len(points)
+            tell(passes + (number + share) / len(steps))
     return changed
 
 
