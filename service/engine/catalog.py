@@ -390,7 +390,11 @@ class Catalog:
         version = self._versions.get(ref)
         outline: object = None if version is None else version.outline
         if version is None or version.folder is None:
-            outline = await asyncio.to_thread(read_any_outline, folder)
+            try:
+                outline = await asyncio.to_thread(read_any_outline, folder)
+            except MapCorrupt:
+                await self.fetcher.folder(ref)  # NotFound, where another server just deleted it
+                raise
             version = self._versions.setdefault(ref, _Version())
         version.outline = outline if isinstance(outline, SetOutline) else None
         version.folder = MapFolder(ref, folder, version.outline is not None)

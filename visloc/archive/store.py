@@ -101,7 +101,12 @@ class MapStore:
 
     def outline(self, ref: str) -> MapOutline | SetOutline:
         """Describe ``id`` or ``id@version`` without opening its arrays; raises as ``open``."""
-        return self.backend.outline(*self._found(ref))
+        map_id, version = self._found(ref)
+        try:
+            return self.backend.outline(map_id, version)
+        except MapCorrupt:
+            self._found(f"{map_id}@{version}")  # NotFound, where it was deleted meanwhile
+            raise
 
     def publish(
         self,

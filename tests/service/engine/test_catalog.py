@@ -320,6 +320,27 @@ def test_no_maps_at_all_is_a_state_to_be_ready_in(tmp_path: Path) -> None:
     run(play())
 
 
+def test_a_version_that_another_server_deletes_while_it_is_read_is_not_there(
+    maps_dir: Path, query: Query, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    publish(maps_dir, "v2", "hall")
+    read = catalog.read_any_outline
+
+    def deleted(folder: Path) -> object:
+        shutil.rmtree(folder)
+        return read(folder)
+
+    async def play(engine: Engine) -> None:
+        publish(maps_dir, "v3", "hall")
+        monkeypatch.setattr(catalog, "read_any_outline", deleted)
+        with pytest.raises(NotFound) as caught:
+            await engine.localize(job_for(query, "hall@v3"))
+        assert caught.value.code == "map.version"
+
+    with started(maps_dir) as with_engine:
+        with_engine(play)
+
+
 def test_a_version_is_deleted_after_the_requests_that_began_with_it(
     maps_dir: Path, query: Query
 ) -> None:

@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from visloc.archive import MapStore
+from visloc.archive.backends import folder
 from visloc.archive.checks import json_text, manifest_hash
 from visloc.errors import Conflict, Forbidden, MapCorrupt, NotFound, StorageFull
 
@@ -164,6 +165,21 @@ def test_a_full_disk_does_not_keep_a_version_from_being_removed(
 def test_what_is_not_there_is_not_removed(two_versions: MapStore) -> None:
     with pytest.raises(NotFound, match="v1, v2") as caught:
         two_versions.remove("room", "v3")
+    assert caught.value.code == "map.version"
+
+
+def test_a_version_that_is_removed_while_it_is_described_is_not_there(
+    two_versions: MapStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read = folder.read_any_outline
+
+    def removed(place: Path) -> object:
+        shutil.rmtree(place)
+        return read(place)
+
+    monkeypatch.setattr(folder, "read_any_outline", removed)
+    with pytest.raises(NotFound, match="v2") as caught:
+        two_versions.outline("room@v1")
     assert caught.value.code == "map.version"
 
 
