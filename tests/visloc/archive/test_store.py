@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 
 from visloc.archive import MapStore
-from visloc.archive.backends import folder
 from visloc.archive.checks import json_text, manifest_hash
+from visloc.archive.sets import read_any_outline
 from visloc.errors import Conflict, Forbidden, MapCorrupt, NotFound, StorageFull
 
 
@@ -171,13 +171,11 @@ def test_what_is_not_there_is_not_removed(two_versions: MapStore) -> None:
 def test_a_version_that_is_removed_while_it_is_described_is_not_there(
     two_versions: MapStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    read = folder.read_any_outline
+    def removed(folder: Path) -> object:
+        shutil.rmtree(folder)
+        return read_any_outline(folder)
 
-    def removed(place: Path) -> object:
-        shutil.rmtree(place)
-        return read(place)
-
-    monkeypatch.setattr(folder, "read_any_outline", removed)
+    monkeypatch.setattr("visloc.archive.backends.folder.read_any_outline", removed)
     with pytest.raises(NotFound, match="v2") as caught:
         two_versions.outline("room@v1")
     assert caught.value.code == "map.version"
