@@ -46,7 +46,9 @@ def test_neither_secret_nor_token_is_in_the_file_and_nobody_else_may_read_it(pat
     key, token = new_key("robot", frozenset(Scope), rate=2.5, burst=4, concurrency=3)
     stored(path, key)
 
-    assert token.rpartition("_")[2] not in path.read_text()
+    parts = split_token(token)
+    assert parts is not None
+    assert parts[1] not in path.read_text()
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     assert read_keys(path) == (key,)
     assert [file.name for file in path.parent.iterdir()] == ["keys.json"]
