@@ -58,6 +58,7 @@ from mapping.stages.work_folder import WorkFolder, exclusive
 from visloc.archive import GlobalFeatures, Map, MapStore
 from visloc.archive.schema import Doubt
 from visloc.errors import refuse
+from visloc.features import check_local_features
 from visloc.features.backends.choice import choose_inference
 from visloc.features.local.readymade import is_ready_made
 from visloc.kapture import Dataset
@@ -105,28 +106,27 @@ def build_map(
         refuse_long_id(settings.map_id)
     store = open_store(settings.maps_dir, settings.cache_dir)
     refuse_existing_map(settings.map_id, store, force=settings.force)
-    networks = Networks(settings.weights_dir, settings.inference)
-    networks.open(settings.local_features, settings.global_features)
+    if not is_ready_made(settings.local_features):
+        check_local_features(settings.local_features)
     scratch = scratch_folder(settings.maps_dir, settings.cache_dir, settings.map_id)
     work = WorkFolder(work_place(settings.work_dir or settings.maps_dir, settings.map_id))
     try:
         with (
             opened_dataset(settings.dataset) as dataset,
-            exclusive(scratch.with_name(f"{scratch.name}.lock")),
+            open_executor(settings.executor, settings.workers, settings.ray_address) as workers,
+            one_thread_here(),  # so that processors do not change the result
         ):
-            if settings.work_dir is not None:
-                work.claim()
-            with open_executor(
-                settings.executor, settings.workers, settings.ray_address
-            ) as workers:
-                if costs is not None:
-                    progress = costs.measured(progress, workers)
-                with one_thread_here():  # so that processors do not change the result
-                    context = _context(settings, networks, work, workers, progress)
-                    dataset = dataset.with_pixels_from(settings.pixel_origin)
-                    folder = _Job(settings, dataset, store, scratch, context, finish, examine).run()
-            work.remove()
-            shutil.rmtree(scratch, ignore_errors=True)
+            if costs is not None:
+                progress = costs.measured(progress, workers)
+            # It opens the networks: missing weights are told before anything is written.
+            context = _context(settings, work, workers, progress)
+            with exclusive(scratch.with_name(f"{scratch.name}.lock")):
+                if settings.work_dir is not None:
+                    work.claim()
+                dataset = dataset.with_pixels_from(settings.pixel_origin)
+                folder = _Job(settings, dataset, store, scratch, context, finish, examine).run()
+                work.remove()
+                shutil.rmtree(scratch, ignore_errors=True)
     except storage_errors() as error:
         raise storage_failed(error, work.root) from error
     return folder
@@ -150,12 +150,9 @@ def refuse_existing_map(map_id: str, store: MapStore, *, force: bool) -> None:
 
 
 def _context(
-    settings: BuildSettings,
-    networks: Networks,
-    work: WorkFolder,
-    workers: Executor,
-    progress: Progress,
+    settings: BuildSettings, work: WorkFolder, workers: Executor, progress: Progress
 ) -> BuildContext:
+    networks = Networks(settings.weights_dir, settings.inference)
     features = local_features_source(
         work,
         settings.dataset,

@@ -22,15 +22,17 @@ from mapping.capture.sources import Sources, find_sources, read_capture, study_v
 from mapping.capture.trying import doubts_of_capture
 from mapping.cluster.stage_timings import Costs
 from mapping.cluster.storage import storage_failed
+from mapping.cluster.workers import Workers
 from mapping.importers import ImportedModel, write_imported
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.pairing import PairSettings
-from mapping.progress import Progress
+from mapping.progress import Progress, not_told
 from mapping.stages.networks import Networks
 from mapping.stages.photos import collect_photos
 from mapping.stages.work_folder import WorkFolder, exclusive
 from visloc.archive import MapStore
 from visloc.errors import VislocError, refuse
+from visloc.features.local.readymade import is_ready_made
 from visloc.kapture import read_dataset
 from visloc.options import Inference
 
@@ -122,8 +124,7 @@ def capture_map(
         raise refuse("capture.two_scales", field="--marker-size")
     store = MapStore(settings.maps_dir)
     sources = find_sources(settings.sources)
-    networks = Networks(settings.weights_dir, Inference.AUTO)
-    networks.open(settings.local_features, settings.global_features)
+    _open_networks(settings)
     # Ids begin with a letter or digit: no work folder of a build has this name.
     root = settings.maps_dir / ".work" / f".capture-{settings.map_id}"
     with _told_of_the_disk(root), exclusive(root.with_name(f"{root.name}.lock")):
@@ -155,6 +156,16 @@ def capture_map(
                 partial(doubts_of_capture, films=studied, measured=_measured(yardstick)),
             )
     return Captured(folder, studied, names, notes, root)
+
+
+def _open_networks(settings: CaptureSettings) -> None:
+    """Open what the build will need, as it looks for weights only after minutes of video."""
+    networks = Networks(settings.weights_dir, Inference.AUTO)
+    for name in settings.global_features:
+        if not is_ready_made(name):
+            networks.descriptor(name)
+    with Workers(settings.workers) as workers:
+        workers.run_here(networks.properties, [settings.local_features], not_told)
 
 
 @contextmanager

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -14,7 +13,6 @@ from visloc.features import (
     make_global_descriptor,
     make_local_features,
 )
-from visloc.features.local.readymade import is_ready_made
 from visloc.options import Inference
 from visloc.types import Fingerprint
 
@@ -34,20 +32,6 @@ class Networks:
 
     weights_dir: Path | None
     inference: Inference
-
-    def open(self, local_features: str, global_features: Sequence[str]) -> None:
-        """Open what a build needs, so that a missing file is told before any work.
-
-        Features that another program computed need nothing.
-
-        Raises:
-            WeightsError, InvalidInput: what ``extractor`` and ``descriptor`` raise.
-        """
-        if not is_ready_made(local_features):
-            self.extractor(local_features)
-        for name in global_features:
-            if not is_ready_made(name):
-                self.descriptor(name)
 
     def extractor(self, name: str) -> LocalFeatureExtractor:
         """Return this process's extractor.

@@ -32,6 +32,7 @@ __all__ = [
     "GlobalDescriptor",
     "ImageDescriptor",
     "LocalFeatureExtractor",
+    "check_local_features",
     "global_feature_names",
     "local_feature_names",
     "make_global_descriptor",
@@ -69,6 +70,15 @@ def local_feature_names() -> list[str]:
 def global_feature_names() -> list[str]:
     """Return the names of all installed global descriptors, plug-ins included."""
     return sorted({*GLOBAL_FEATURES, *plugin_names(GLOBAL_FEATURES_GROUP)})
+
+
+def check_local_features(name: str) -> None:
+    """Refuse a name that no installed local features have, without loading any.
+
+    Raises:
+        InvalidInput: ``features.unknown``.
+    """
+    _refuse_unknown(LOCAL_FEATURES, LOCAL_FEATURES_GROUP, name)
 
 
 def make_local_features(

@@ -575,3 +575,15 @@ def test_a_file_that_cannot_be_written_whole_ends_the_command_with_one_line(
     assert error.startswith(f"error [storage.failed] {maps_dir / '.work' / 'room'}: ")
     assert "File too large" in error
     assert MapStore(maps_dir).open("room").manifest == before
+
+
+def test_with_workers_the_main_process_loads_no_torch(sample: Path, tmp_path: Path) -> None:
+    """It costs the main process two seconds and a quarter of a gigabyte."""
+    program = (
+        "import sys; from pathlib import Path; from mapping.build.build import build_map;"
+        "from mapping.build.settings import BuildSettings; from mapping.progress import nothing_told;"
+        "settings = BuildSettings(Path(sys.argv[1]), 'room', Path(sys.argv[2]), workers=2);"
+        "build_map(settings, nothing_told); print('torch' in sys.modules)"
+    )
+    words = [sys.executable, "-c", program, str(sample / "mapping"), str(tmp_path / "maps")]
+    assert subprocess.run(words, check=True, capture_output=True, text=True).stdout == "False\n"
