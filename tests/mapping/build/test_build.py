@@ -581,7 +581,8 @@ def test_with_workers_the_main_process_loads_no_torch(sample: Path, tmp_path: Pa
     """It costs the main process two seconds and a quarter of a gigabyte."""
     program = (
         "import sys; from pathlib import Path; from mapping.build.build import build_map;"
-        "from mapping.build.settings import BuildSettings; from mapping.progress import nothing_told;"
+        "from mapping.build.settings import BuildSettings;"
+        "from mapping.progress import nothing_told;"
         "settings = BuildSettings(Path(sys.argv[1]), 'room', Path(sys.argv[2]), workers=2);"
         "build_map(settings, nothing_told); print('torch' in sys.modules)"
     )
