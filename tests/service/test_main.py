@@ -63,7 +63,9 @@ def test_who_comes_just_after_sigterm_is_told_that_the_server_stops(built_maps: 
                 answer = client.post(url, files={"image": b"x"}, data={"map": "room"})
                 told.append(answer.json()["code"])
 
-        with httpx.Client(limits=httpx.Limits(max_keepalive_connections=0)) as client:
+        # A minute, so that a busy machine may be slow; a request that nobody answers still fails.
+        none_kept = httpx.Limits(max_keepalive_connections=0)
+        with httpx.Client(limits=none_kept, timeout=60) as client:
             process.send_signal(signal.SIGTERM)
             with pytest.raises(httpx.ConnectError):  # refused, not reset
                 ask_for_ever(client)
