@@ -20,7 +20,7 @@ from visloc.localization.localizer import Localizer
 from visloc.localization.query.feature_cache import FeatureCache
 from visloc.localization.solving import Look
 from visloc.options import LocalizeOptions
-from visloc.pose.centre import moved_origin
+from visloc.pose.centre import moved_origin, position_covariance
 from visloc.pose.colmap import project
 from visloc.pose.generalized import GeneralizedPose, refine_generalized_pose
 from visloc.pose.views import MatchedView
@@ -57,6 +57,7 @@ class Staged:
         turned: degrees by which the photo was turned before it was answered.
         error: distance to the truth, units of the map; None without a pose.
         error_deg: as above, degrees.
+        distance2: that distance squared in units of the stated covariance of the position.
         probability: what the answer stated; None for a refusal.
         seconds: until the answer.
     """
@@ -74,6 +75,7 @@ class Staged:
     turned: int
     error: float | None
     error_deg: float | None
+    distance2: float | None
     probability: float | None
     seconds: float
 
@@ -142,6 +144,7 @@ class Staging:
             answer.evidence.turned,
             None if error is None else error[0],
             None if error is None else error[1],
+            _distance2(answer, truth) if isinstance(answer, Localized) else None,
             answer.probability if isinstance(answer, Localized) else None,
             sum(answer.evidence.seconds.values()) if accepted else 0.0,
         )
@@ -237,6 +240,13 @@ class Staging:
         }
         fused = retrieve(query, index, num, fusion=opened.fusion).images
         return {name: _first(showing[rows]) for name, rows in {**ranked, "fused": fused}.items()}
+
+
+def _distance2(answer: Localized, truth: Pose) -> float:
+    """Square the distance of an answer from the truth, in units of its stated covariance."""
+    covariance = position_covariance(answer.cam_from_world, answer.covariance)
+    error = answer.cam_from_world.center - truth.center
+    return float(error @ np.linalg.solve(covariance, error))
 
 
 def _first(shown: NDArray[np.bool_]) -> int:

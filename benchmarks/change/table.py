@@ -6,8 +6,12 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+from scipy.stats import chi2
 
 from benchmarks.change.stages import OPTIONS, STAGES, Staged
+
+# Chi-square of a position: 95 % of the squared distances are below it.
+_INSIDE = float(chi2.ppf(0.95, 3))
 
 
 def write_tables(found: Sequence[Staged]) -> Iterator[str]:
@@ -16,9 +20,9 @@ def write_tables(found: Sequence[Staged]) -> Iterator[str]:
     yield "\n**Where photos are lost**\n"
     yield (
         "| condition | photos | right | wrong | lost in retrieval | matching | pose | gate "
-        "| refused because | median error |"
+        "| refused because | median error | truth inside the stated 95 % |"
     )
-    yield "|---|---|---|---|---|---|---|---|---|---|"
+    yield "|---|---|---|---|---|---|---|---|---|---|---|"
     for condition in conditions:
         rows = [each for each in found if each.condition == condition]
         yield _stages(condition, rows)
@@ -42,4 +46,7 @@ def _stages(condition: str, rows: Sequence[Staged]) -> str:
     errors = [each.error for each in rows if each.lost == "right" and each.error is not None]
     error = f"{np.median(errors):.3f}" if errors else "-"
     lost = [counts[stage] for stage in ("right", "wrong", *STAGES[1:5])]
-    return f"| {condition} | {len(rows)} | {' | '.join(map(str, lost))} | {told} | {error} |"
+    distances = [each.distance2 for each in rows if each.distance2 is not None]
+    inside = f"{np.mean(np.array(distances) <= _INSIDE):.0%}" if distances else "-"
+    cells = [condition, len(rows), *lost, told, error, inside]
+    return f"| {' | '.join(map(str, cells))} |"

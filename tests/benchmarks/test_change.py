@@ -47,7 +47,7 @@ def test_strengths_rise(kind: str) -> None:
 
 def staged(lost: str, ranks: dict[str, int], reason: str | None = None) -> Staged:
     return Staged(
-        "night", "m", "p", lost, reason, ranks, 3, 100, 40, 40, 0, 0.1, 1.0, 0.5, 0.1
+        "night", "m", "p", lost, reason, ranks, 3, 100, 40, 40, 0, 0.1, 1.0, 2.0, 0.5, 0.1
     )  # fmt: skip
 
 
@@ -58,8 +58,8 @@ def test_the_tables_count_each_photo_once() -> None:
         staged("retrieval", {"a": 0, "fused": 30}, "too_few_inliers"),
     ]
     lines = list(write_tables(found))
-    stages = "| night | 3 | 1 | 0 | 1 | 0 | 0 | 1 | low_inlier_ratio 1, too_few_inliers 1 | 0.100 |"
-    assert stages in lines
+    told = "low_inlier_ratio 1, too_few_inliers 1"
+    assert f"| night | 3 | 1 | 0 | 1 | 0 | 0 | 1 | {told} | 0.100 | 100% |" in lines
     assert "| night | 3 | 1 | 2 |" in lines  # among the first 20, by descriptor a and fused
 
 

@@ -14,6 +14,7 @@ from visloc.localization.acceptance.camera_check import only_focal_length_contra
 from visloc.localization.acceptance.evidence import Shown
 from visloc.localization.acceptance.gates import Problem, accepted, not_better_elsewhere
 from visloc.localization.acceptance.judge import not_probable_enough
+from visloc.localization.acceptance.redraws import with_redraws
 from visloc.localization.acceptance.rivals import Proposed, stronger_place
 from visloc.localization.geometry.constraints import Constraints, MapGeometry
 from visloc.localization.turning import REASONS_OF_TURNED_PHOTOS
@@ -196,6 +197,8 @@ def solve_instant(
         if refusal is None and found is not None and len(proposed) == len(looks):
             place, refusal, scores = stronger_place(problem, geometry, proposed, found)
             found, refusal = (place, refusal) if place is found else accepted(problem, place)
+        if refusal is None and found is not None:
+            found, refusal = with_redraws(problem, found)
         refusal = refusal and _with_turned_photos(refusal, looks)
     pose = None
     if refusal is None and found is not None and found.covariance is not None:

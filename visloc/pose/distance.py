@@ -25,12 +25,28 @@ def mahalanobis2(
         b: as ``a``.
         covariance_b: of ``b``; its errors are independent of those of ``a``.
     """
-    # In terms of rotation and centre: far from the origin, t is not linear in the rotation.
+    floor = np.diag([_MAP_STD_RAD**2] * 3 + [_MAP_STD**2] * 3)
+    return _distance2(
+        a, b, center_covariance(a, covariance_a) + center_covariance(b, covariance_b) + floor
+    )
+
+
+def normalized_distance2(a: Pose, b: Pose, covariance_b: NDArray[np.float64]) -> float:
+    """Return the squared distance of a pose from another, in units of that one's covariance alone.
+
+    Arguments and result as of ``mahalanobis2``; errors of the map have no part in it.
+    """
+    return _distance2(a, b, center_covariance(b, covariance_b))
+
+
+def _distance2(a: Pose, b: Pose, total: NDArray[np.float64]) -> float:
+    """Return the squared distance in units of a covariance (6, 6) of rotation and centre.
+
+    In these terms because far from the origin, t is not linear in the rotation.
+    """
     difference = np.concatenate(
         [Rotation.from_matrix(a.rotation @ b.rotation.T).as_rotvec(), a.center - b.center]
     )
-    floor = np.diag([_MAP_STD_RAD**2] * 3 + [_MAP_STD**2] * 3)
-    total = center_covariance(a, covariance_a) + center_covariance(b, covariance_b) + floor
     try:
         squared = float(difference @ np.linalg.solve(total, difference))
     except np.linalg.LinAlgError:

@@ -78,11 +78,22 @@ class Problem:
         """Return the same search with other views."""
         return replace(self, views=tuple(views))
 
-    def solve(self, *, with_gravity: bool = True) -> GeneralizedPose | None:
+    def near_prior(self) -> Sequence[MatchedView]:
+        """Return the views with what a pose prior allows; all without one.
+
+        A pose prior may have decided between two places that explain the images.
+        """
+        threshold = self.registration.max_error_px
+        return self.constraints.near_pose_prior(self.views, threshold) or self.views
+
+    def solve(
+        self, *, with_gravity: bool = True, seed: int | None = None
+    ) -> GeneralizedPose | None:
+        """Search; with the seed of the options, unless another one is given."""
         return estimate_generalized_pose(
             self.views,
             max_error_px=self.registration.max_error_px,
-            seed=self.options.seed,
+            seed=self.options.seed if seed is None else seed,
             gravity=self.constraints.gravity if with_gravity else None,
             solver=self.options.solver,
         )
@@ -212,9 +223,7 @@ def halves_agree(problem: Problem, pose: GeneralizedPose) -> Refusal | None:
             "the focal length was estimated with the pose; such a pose needs "
             f"{_SURE_INLIERS} inliers, but has {pose.num_inliers}: send the camera",
         )
-    # A pose prior may have decided between two places that explain the photo.
-    near = problem.constraints.near_pose_prior(problem.views, problem.registration.max_error_px)
-    views = near or problem.views
+    views = problem.near_prior()
     random = np.random.default_rng(options.seed)
     first = [random.permutation(len(view)) < len(view) // 2 for view in views]
     halves = []
