@@ -49,7 +49,10 @@ def main(
                 continue
             camera = dataset.sensors[record.sensor_id].camera
             look = localizer.look(read_photo_file(dataset.path_of(record)), camera, OPTIONS)
-            truth = moved_origin(dataset.pose(record), -localizer.geometry.origin)
+            known = dataset.pose(record)
+            if known is None:
+                raise typer.BadParameter(f"{record.path}: no pose in {queries}")
+            truth = moved_origin(known, -localizer.geometry.origin)
             view = MatchedView(
                 look.camera, Pose.identity(), look.matches.pixels, look.matches.points
             )

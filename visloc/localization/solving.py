@@ -198,7 +198,7 @@ def solve_instant(
             place, refusal, scores = stronger_place(problem, geometry, proposed, found)
             found, refusal = (place, refusal) if place is found else accepted(problem, place)
         if refusal is None and found is not None:
-            found, refusal = with_redraws(problem, found)
+            found, refusal = with_redraws(problem, found, geometry.reach)
         refusal = refusal and _with_turned_photos(refusal, looks)
     pose = None
     if refusal is None and found is not None and found.covariance is not None:

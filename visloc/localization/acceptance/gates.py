@@ -99,6 +99,12 @@ class Problem:
         )
 
 
+def asks_for_weak_poses(options: LocalizeOptions) -> bool:
+    """Whether a caller names a preset of the paper, or fewer inliers than the default."""
+    by_default = PRESETS[DEFAULT_PRESET].min_inliers
+    return options.preset != DEFAULT_PRESET or options.registration.min_inliers < by_default
+
+
 Gate = Callable[[Problem, GeneralizedPose], Refusal | None]
 
 
@@ -210,12 +216,7 @@ def halves_agree(problem: Problem, pose: GeneralizedPose) -> Refusal | None:
     such a pose needs more inliers instead.
     """
     options = problem.options
-    by_default = PRESETS[DEFAULT_PRESET].min_inliers
-    if (
-        pose.num_inliers >= _SURE_INLIERS
-        or options.preset != DEFAULT_PRESET
-        or options.registration.min_inliers < by_default  # the caller asked for weak poses
-    ):
+    if pose.num_inliers >= _SURE_INLIERS or asks_for_weak_poses(options):
         return None
     if pose.camera is not None:
         return _refused(

@@ -1,77 +1,123 @@
 """How far a pose moves when its matches are drawn again: the bootstrap of Efron (1979).
 
-The covariance of a pose describes one minimum of the loss, with the inliers that it has there. Of a
-blurred photo, errors of right matches are as large as the inlier threshold. Then another choice of
-inliers leads to another minimum that explains as much, several stated deviations away
-(docs/decisions/0049-matches-drawn-again.md).
+The covariance of a pose describes one minimum of the loss, with the inliers that it has there. Few
+matches, or matches whose errors are as large as the inlier threshold, may have several minima that
+explain about as much, many stated deviations apart: of a blurred photo, or of a facade, which has
+two such poses (docs/decisions/0049-matches-drawn-again.md).
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from visloc.localization.acceptance.gates import Problem
+from visloc.localization.acceptance.gates import Problem, asks_for_weak_poses
+from visloc.localization.acceptance.judge import TIE_ANGLE, TIE_REACH_SHARE
+from visloc.pose.centre import largest_std
 from visloc.pose.distance import normalized_distance2
 from visloc.pose.generalized import GeneralizedPose
 from visloc.pose.reprojection import reprojection_errors
+from visloc.pose.views import MatchedView
 from visloc.types import Reason, Refusal
 
 # The ring beyond the inlier threshold out to so many times it has the area of the disc within. If
 # it holds more than this share of the inliers' number, right matches may lie beyond the threshold.
 _RING, _CROWDED = math.sqrt(2.0), 0.1
+# With so many inliers, other draws of matches that are not crowded agree.
+_MANY_INLIERS = 300
+# Other minima nearby explain matches that are so many thresholds off. What lies beyond would make
+# each search take thirty times longer, and is of other places (``rivals``).
+_DRAWN_WITHIN = 4.0
 _REDRAWS = 8
 # The median of chi-square with the six degrees of freedom of a pose.
 _MEDIAN_CHI2_6 = float(chdtri(6, 0.5))
 
 
-def with_redraws(problem: Problem, pose: GeneralizedPose) -> tuple[GeneralizedPose, Refusal | None]:
+def with_redraws(
+    problem: Problem, pose: GeneralizedPose, reach: float
+) -> tuple[GeneralizedPose, Refusal | None]:
     """Widen the covariance of an accepted pose to what other draws of its matches say.
 
-    Asked only of poses with many matches just beyond the inlier threshold, as each of the eight
-    draws takes a search.
+    Asked of poses with few inliers, or with many matches just beyond the inlier threshold.
+
+    Args:
+        problem: whose pose it is.
+        pose: passed the gates.
+        reach: how far the map's photos see, units of the world.
 
     Returns:
-        The pose, and ``uncertain_pose`` if half of the draws or more lead to no pose.
+        The pose, and ``uncertain_pose`` if draws leave open where it is: if half of them lead to no
+        pose, or if the stated deviation is then as large as what takes a photo to another place. A
+        caller who asks for weak poses gets the latter.
     """
-    if pose.covariance is None or crowding(problem, pose) <= _CROWDED:
+    if pose.covariance is None or not _is_asked(problem, pose):
         return pose, None
     factor = widening(problem, pose)
     if math.isinf(factor):
-        return pose, Refusal(
-            "gate",
-            Reason.UNCERTAIN_POSE,
-            f"at least half of {_REDRAWS} other draws of the matches lead to no pose: the photo "
-            "is blurred, or shows another place",
-        )
+        return pose, _uncertain("at least half of them lead to no pose")
     of_camera = None if pose.of_camera is None else factor * pose.of_camera
-    return replace(pose, covariance=factor * pose.covariance, of_camera=of_camera), None
+    wider = replace(pose, covariance=factor * pose.covariance, of_camera=of_camera)
+    if factor > 1.0 and not asks_for_weak_poses(problem.options):
+        whole = problem.constraints.errors.whole(
+            wider.rig_from_world, factor * pose.covariance, of_camera
+        )
+        std, turn_std = largest_std(wider.rig_from_world, whole), _largest_turn_std(whole)
+        if std > TIE_REACH_SHARE * reach or turn_std > TIE_ANGLE:
+            told = (
+                f"they scatter by {std:.2g} (standard deviation) and {math.degrees(turn_std):.1f}°"
+            )
+            return pose, _uncertain(told)
+    return wider, None
+
+
+def _uncertain(why: str) -> Refusal:
+    return Refusal(
+        "gate",
+        Reason.UNCERTAIN_POSE,
+        f"the pose was searched again with {_REDRAWS} other draws of its matches: {why}; the photo "
+        "is blurred, or shows too little of the map: take one with more of the scene",
+    )
+
+
+def _largest_turn_std(covariance: NDArray[np.float64]) -> float:
+    return math.sqrt(max(float(np.linalg.eigvalsh(covariance[:3, :3])[-1]), 0.0))
+
+
+def _is_asked(problem: Problem, pose: GeneralizedPose) -> bool:
+    return pose.num_inliers < _MANY_INLIERS or crowding(problem, pose) > _CROWDED
 
 
 def crowding(problem: Problem, pose: GeneralizedPose) -> float:
     """Return the number of matches just beyond the inlier threshold, as a share of the inliers."""
     threshold = problem.registration.max_error_px
-    beyond = 0
-    for view in problem.views:
-        seen = view if pose.camera is None else replace(view, camera=pose.camera)
-        errors = reprojection_errors(seen, pose.rig_from_world)  # NaN lies nowhere
-        beyond += int(((errors > threshold) & (errors <= _RING * threshold)).sum())
+    beyond = sum(
+        int(((errors > threshold) & (errors <= _RING * threshold)).sum())
+        for errors in _errors(problem.views, pose)
+    )
     return beyond / pose.num_inliers
 
 
 def widening(problem: Problem, pose: GeneralizedPose) -> float:
     """Return by how much the covariance of a pose must grow, at least 1.
 
-    The search is repeated with as many matches, drawn with replacement. The result is the median
-    squared distance of these poses from ``pose``, in units of its covariance, over the median of
-    chi-square with six degrees of freedom; infinite if half of the draws lead to no pose. (The
-    mean would grow a hundredfold where one draw of eight finds another place.)
+    The search is repeated on the matches that lie near the pose, as many, drawn with replacement.
+    The result is the median squared distance of these poses from ``pose``, in units of its
+    covariance, over the median of chi-square with six degrees of freedom; infinite if half of the
+    draws lead to no pose. (The mean would grow a hundredfold where one draw of eight finds another
+    place.)
     """
     assert pose.covariance is not None
+    within = _DRAWN_WITHIN * problem.registration.max_error_px
     views = problem.near_prior()
+    views = [
+        view.selected(errors <= within)
+        for view, errors in zip(views, _errors(views, pose), strict=True)
+    ]
     random = np.random.default_rng(problem.options.seed)
     distances = []
     for redraw in range(_REDRAWS):
@@ -84,3 +130,13 @@ def widening(problem: Problem, pose: GeneralizedPose) -> float:
             else normalized_distance2(found.rig_from_world, pose.rig_from_world, pose.covariance)
         )
     return max(1.0, float(np.median(distances)) / _MEDIAN_CHI2_6)
+
+
+def _errors(views: Sequence[MatchedView], pose: GeneralizedPose) -> list[NDArray[np.float64]]:
+    """Return the reprojection errors of each view; NaN, behind the camera, is beyond all limits."""
+    found = []
+    for view in views:
+        seen = view if pose.camera is None else replace(view, camera=pose.camera)
+        with np.errstate(invalid="ignore"):  # landmarks that are no numbers
+            found.append(reprojection_errors(seen, pose.rig_from_world))
+    return found
