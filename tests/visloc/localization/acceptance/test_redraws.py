@@ -14,6 +14,7 @@ from visloc.localization.acceptance.gates import Problem
 from visloc.localization.geometry.constraints import Constraints
 from visloc.localization.solving import Matches, SeenImage, Solved, solve_instant
 from visloc.options import LocalizeOptions
+from visloc.pose.colmap import normalized_rays
 from visloc.priors import NO_PRIORS
 from visloc.types import CameraSource, Reason
 
@@ -29,6 +30,22 @@ def smeared(place: Any, pose: Pose, length_px: float, seed: int) -> Matches:
     angle = rng.uniform(0.0, np.pi)
     along = rng.uniform(-0.5, 0.5, (300, 1)) * length_px * [np.cos(angle), np.sin(angle)]
     return replace(matches, pixels=matches.pixels + along)
+
+
+def facade(place: Any, seed: int) -> Matches:
+    """110 right and 300 wrong matches; the right ones lie on a small plane, seen nearly frontally.
+
+    Of such a plane two poses explain nearly the same (Schweighofer and Pinz 2006).
+    """
+    rng = np.random.default_rng(seed)
+    pixels = rng.normal([322.0, 239.0], (60.0, 40.0), (110, 2))
+    rays = normalized_rays(place.camera, pixels)
+    normal = np.array([np.sin(0.2), 0.0, np.cos(0.2)])
+    points = TRUTH.inverse().apply(rays * (30.0 * normal[2] / (rays @ normal))[:, None])
+    wrong = TRUTH.center + rng.uniform(-40.0, 40.0, (300, 3))
+    pixels = pixels + rng.normal(size=pixels.shape) * 3.0
+    anywhere = rng.uniform([5, 5], [635, 475], (300, 2))
+    return Matches(np.vstack([pixels, anywhere]), np.vstack([points, wrong]))
 
 
 def photo(place: Any, length_px: float, seed: int) -> list[SeenImage]:
@@ -73,6 +90,19 @@ def test_of_smeared_photos_the_stated_covariance_grows_to_what_is_true(
     assert np.mean(before <= limit) <= 0.2
     assert np.mean(after <= limit) >= 0.4
     assert np.median(after) <= np.median(before) / 4
+
+
+def test_of_a_facade_the_wrong_one_of_two_poses_is_refused_or_stated_as_uncertain(
+    place: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    images = [[place.image(facade(place, seed))] for seed in range(TRIALS)]
+    answered = [solved for each in images if (solved := solve(each, place)).answer.pose]
+    monkeypatch.setattr(redraws, "_is_asked", lambda *_: False)
+    of_one_minimum = [solved for each in images if (solved := solve(each, place)).answer.pose]
+    limit = chi2.ppf(0.999, 6)
+    assert np.sum(distances2(of_one_minimum, place) > 10 * limit) >= 2
+    assert len(answered) >= 4
+    assert np.all(distances2(answered, place) <= limit)
 
 
 def test_a_sharp_photo_is_not_searched_again(place: Any, monkeypatch: pytest.MonkeyPatch) -> None:
