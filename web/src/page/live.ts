@@ -306,7 +306,7 @@ function answerInWords(
   if (pose === null) return sentence(refusal?.message ?? "no reason was given");
   const std = lengthText(Math.hypot(...pose.position_std), metric, 2);
   const alone = pose.uncertainty === "photo only" ? " by scatter alone" : "";
-  const sure = pose.probability === null ? "" : ` Right with ${pose.probability.toFixed(2)}.`;
+  const sure = pose.probability === null ? "" : ` Probability ${pose.probability.toFixed(2)}.`;
   const agree = `${countText(inliers)} of ${countText(correspondences)} matches agree.`;
   const earth =
     geopose === null ? "" : ` On Earth ${positionText(geopose)}, heading ${headingText(geopose)}.`;
