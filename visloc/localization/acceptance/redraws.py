@@ -34,6 +34,7 @@ _MANY_INLIERS = 300
 # each search take thirty times longer, and is of other places (``rivals``).
 _DRAWN_WITHIN = 4.0
 _REDRAWS = 8
+_STDS = 2.0
 # The median of chi-square with the six degrees of freedom of a pose.
 _MEDIAN_CHI2_6 = float(chdtri(6, 0.5))
 
@@ -52,8 +53,8 @@ def with_redraws(
 
     Returns:
         The pose, and ``uncertain_pose`` if draws leave open where it is: if half of them lead to no
-        pose, or if the stated deviation is then as large as what takes a photo to another place. A
-        caller who asks for weak poses gets the latter.
+        pose, or if two deviations of their scatter reach another place. A caller who asks for weak
+        poses gets the wider covariance in the second case.
     """
     if pose.covariance is None or not _is_asked(problem, pose):
         return pose, None
@@ -63,15 +64,10 @@ def with_redraws(
     of_camera = None if pose.of_camera is None else factor * pose.of_camera
     wider = replace(pose, covariance=factor * pose.covariance, of_camera=of_camera)
     if factor > 1.0 and not asks_for_weak_poses(problem.options):
-        whole = problem.constraints.errors.whole(
-            wider.rig_from_world, factor * pose.covariance, of_camera
-        )
-        std, turn_std = largest_std(wider.rig_from_world, whole), _largest_turn_std(whole)
-        if std > TIE_REACH_SHARE * reach or turn_std > TIE_ANGLE:
-            told = (
-                f"they scatter by {std:.2g} (standard deviation) and {math.degrees(turn_std):.1f}°"
-            )
-            return pose, _uncertain(told)
+        std = largest_std(wider.rig_from_world, factor * pose.covariance)
+        turn_std = _largest_turn_std(factor * pose.covariance)
+        if _STDS * std > TIE_REACH_SHARE * reach or _STDS * turn_std > TIE_ANGLE:
+            return pose, _uncertain(f"they scatter by {std:.2g} (map's unit), {turn_std:.2g} rad")
     return wider, None
 
 
