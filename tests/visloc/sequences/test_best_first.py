@@ -50,7 +50,7 @@ def assert_ordered(part: MatchedView, whole: MatchedView) -> None:
 
 
 @pytest.mark.parametrize("with_prior", [False, True])
-def test_those_of_a_rig_and_of_its_halves(
+def test_those_of_a_rig_of_its_halves_and_of_its_draws(
     place: Any, monkeypatch: pytest.MonkeyPatch, with_prior: bool
 ) -> None:
     images = [
@@ -71,12 +71,16 @@ def test_those_of_a_rig_and_of_its_halves(
     priors = Priors(pose=PosePrior(TRUTH, 0.01 * np.eye(6))) if with_prior else NO_PRIORS
     solved = solve_instant(images, place.geometry, LocalizeOptions(), priors)
     assert solved.pose is not None
-    whole_rig, *halves = searched
+    whole_rig, first, second, *draws = searched
     assert [rows_in(*views) for views in zip(whole_rig, wholes, strict=True)] == [[*range(40)]] * 3
-    assert len(halves) == 2
-    for half in halves:
+    assert len(draws) == 8
+    for half in (first, second):
         for part, whole in zip(half, wholes, strict=True):
             assert 0 < len(part) <= 20
+            assert_ordered(part, whole)
+    for draw in draws:
+        for part, whole in zip(draw, wholes, strict=True):
+            assert 0 < len(part) <= 40
             assert_ordered(part, whole)
 
 
