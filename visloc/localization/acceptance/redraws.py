@@ -34,6 +34,7 @@ _MANY_INLIERS = 300
 # each search take thirty times longer, and is of other places (``rivals``).
 _DRAWN_WITHIN = 4.0
 _REDRAWS = 8
+# So many deviations of the draws must not reach another place.
 _STDS = 2.0
 # The median of chi-square with the six degrees of freedom of a pose.
 _MEDIAN_CHI2_6 = float(chdtri(6, 0.5))
