@@ -31,6 +31,8 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> 
     """Run the command in this process; return exit status, stdout and stderr."""
     monkeypatch.delenv("VISLOC_MAPS_DIR", raising=False)
     monkeypatch.delenv("VISLOC_WEIGHTS_DIR", raising=False)
+    # On a busy machine, a step that takes long would tell so on stderr.
+    monkeypatch.setattr("mapping.cli.progress._LINE_EVERY_S", 3600.0)
 
     def run_command(*arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["mapping", *map(str, arguments)])
