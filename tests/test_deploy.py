@@ -294,7 +294,7 @@ def test_the_dependencies_are_made_before_the_code_is_copied() -> None:
 
     assert copied == [
         ["docker/locks"],
-        ["pyproject.toml", "constraints.txt", "README.md", "LICENSE"],
+        ["pyproject.toml", "hatch_build.py", "constraints.txt", "README.md", "LICENSE"],
         ["visloc/__init__.py"],  # the version
     ]
 

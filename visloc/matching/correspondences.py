@@ -11,14 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.device import torch_device
+from visloc.matching.nearest import Nearest, nearest
 from visloc.matching.on_device import nearest_on
-from visloc.matching.products import (
-    LARGEST_PRODUCT,
-    EightBitRows,
-    block_rows,
-    in_threads,
-    row_products,
-)
+from visloc.matching.products import EightBitRows, in_threads
 
 if TYPE_CHECKING:
     import torch
@@ -129,32 +124,8 @@ def mutual_nearest_neighbours(
     """
     if len(a) == 0 or len(b) == 0:
         return _no_pairs()
-    most_rows = block_rows(len(b))
-    products = row_products(a.rows, b.rows, most_rows)
-    best_b = np.empty(len(a), dtype=np.int64)
-    best = np.empty(len(a), dtype=np.float64)
-    second = None if max_ratio is None else np.empty(len(a), dtype=np.float64)
-    lowest = -a.rows.shape[1] * LARGEST_PRODUCT  # of all; the distance where there is no second
-    column_best, row_starts = None, np.arange(0, most_rows * len(b), len(b))
-    for start in range(0, len(a), most_rows):
-        rows = slice(start, min(start + most_rows, len(a)))
-        block = products(rows)
-        of_columns = block.amax(0).numpy()  # NumPy takes a quarter more time for this
-        if column_best is None:
-            column_best = of_columns
-        else:
-            np.maximum(column_best, of_columns, out=column_best)
-        similarity = block.numpy()
-        similarity.argmax(axis=1, out=best_b[rows])
-        where = best_b[rows] + row_starts[: len(similarity)]
-        best[rows] = similarity.take(where)
-        if second is not None:
-            similarity.put(where, lowest)
-            similarity.max(axis=1, out=second[rows])
-    assert column_best is not None  # there are rows
-    # Equality with the column's maximum replaces a second, slower arg-max over the columns.
-    mutual = np.flatnonzero(best == column_best[best_b])
-    return _pairs(mutual, best_b, best, second, a.scale * b.scale, max_ratio)
+    found = nearest(a.rows, b.rows, with_second=max_ratio is not None)
+    return _pairs(found, a.scale * b.scale, max_ratio)
 
 
 def mutual_nearest_neighbours_on(
@@ -175,10 +146,9 @@ def mutual_nearest_neighbours_on(
     for start in range(0, len(with_rows), step):
         some = with_rows[start : start + step]
         rows = [others[number].rows for number in some]
-        nearest = nearest_on(device, a.rows, rows, with_second=max_ratio is not None)
-        for number, (mutual, best_b, best, second) in zip(some, nearest, strict=True):
-            scale = a.scale * others[number].scale
-            found[number] = _pairs(mutual, best_b, best, second, scale, max_ratio)
+        of_each = nearest_on(device, a.rows, rows, with_second=max_ratio is not None)
+        for number, of_photo in zip(some, of_each, strict=True):
+            found[number] = _pairs(of_photo, a.scale * others[number].scale, max_ratio)
     return found
 
 
@@ -187,23 +157,17 @@ def _no_pairs() -> Pairs:
     return none, none, np.empty(0, dtype=np.float32)
 
 
-def _pairs(
-    mutual: NDArray[np.intp],
-    best_b: NDArray[np.int64],
-    best: NDArray[np.float64],
-    second: NDArray[np.float64] | None,
-    scale: float,
-    max_ratio: float | None,
-) -> Pairs:
+def _pairs(found: Nearest, scale: float, max_ratio: float | None) -> Pairs:
     """Return the mutual rows that are clear and the first ones of their column, as pairs."""
+    mutual, rows, best, second = found
     # Rows with equal similarity to one column (duplicate descriptors): the first one keeps it.
-    mutual = mutual[_first_rows(best_b[mutual]) == np.arange(len(mutual))]
+    mutual = mutual[_first_rows(rows[mutual]) == np.arange(len(mutual))]
     if second is not None and max_ratio is not None:
         # The squared distance of unit vectors is 2 - 2 cos.
         half_squares = (1 - np.clip(s[mutual] * scale, -1, 1) for s in (best, second))
-        nearest, second_nearest = half_squares
-        mutual = mutual[nearest < max_ratio**2 * second_nearest]
-    return mutual, best_b[mutual], (best[mutual] * scale).astype(np.float32)
+        of_nearest, of_second = half_squares
+        mutual = mutual[of_nearest < max_ratio**2 * of_second]
+    return mutual, rows[mutual], (best[mutual] * scale).astype(np.float32)
 
 
 def propose_landmarks(

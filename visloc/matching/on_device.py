@@ -3,31 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from visloc.matching.nearest import Nearest
 from visloc.matching.products import LARGEST_PRODUCT, exact_float
 
 if TYPE_CHECKING:
     import torch
-
-
-class Nearest(NamedTuple):
-    """For each row of one side (n,), the most similar row of a photo.
-
-    Attributes:
-        mutual: (k,) rows whose nearest row has no more similar one, ascending.
-        rows: (n,) int64 rows of the photo; the first of equally similar ones.
-        products: (n,) float64, whole numbers.
-        seconds: (n,) float64 products with the second nearest rows, if they are wanted.
-    """
-
-    mutual: NDArray[np.intp]
-    rows: NDArray[np.int64]
-    products: NDArray[np.float64]
-    seconds: NDArray[np.float64] | None
 
 
 def nearest_on(

@@ -7,7 +7,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from visloc.matching import products
+from visloc.matching import compiled, products
 from visloc.matching.correspondences import (
     Pairs,
     match_landmarks,
@@ -24,6 +24,17 @@ def unit_rows(rng: np.random.Generator, n: int, dim: int = 16) -> NDArray[np.flo
 
 def whole(rows: list[list[int]] | NDArray[np.integer]) -> EightBitRows:
     return EightBitRows(np.array(rows, dtype=np.int8), 1.0)
+
+
+@pytest.fixture(params=["compiled", "torch, 8 bits", "torch, floats"])
+def computed(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compute products in each of the ways that a machine may have."""
+    if request.param == "compiled" and compiled.level() == 0:
+        pytest.skip("there is no compiled code for this machine")
+    if request.param != "compiled":
+        monkeypatch.setattr(compiled, "level", lambda: 0)
+    if request.param == "torch, floats":
+        monkeypatch.setattr(products, "_has_integer_products", lambda: False)
 
 
 def test_a_permuted_copy_is_matched_row_by_row() -> None:
@@ -56,14 +67,10 @@ def test_nothing_matches_nothing(n: int, m: int) -> None:
     assert len(i) == len(j) == len(similarity) == 0
 
 
-@pytest.mark.parametrize("has_integer_products", [True, False])
+@pytest.mark.usefixtures("computed")
 @pytest.mark.parametrize("dim", [1, 2, 3, 64, 128, 1024, 1041])
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (1, 30), (255, 3), (257, 40), (600, 520)])
-def test_pairs_are_those_of_the_definition(
-    monkeypatch: pytest.MonkeyPatch, n: int, m: int, dim: int, *, has_integer_products: bool
-) -> None:
-    if not has_integer_products:
-        monkeypatch.setattr(products, "_has_integer_products", lambda: False)
+def test_pairs_are_those_of_the_definition(n: int, m: int, dim: int) -> None:
     # Small numbers, so that many similarities are equal; one row of the largest, for overflows.
     rng = np.random.default_rng(n + m + dim)
     a, b = (rng.integers(-2, 3, (count, dim)).astype(np.int8) for count in (n, m))
@@ -101,13 +108,9 @@ def test_a_photo_with_one_landmark_has_no_second_nearest() -> None:
     assert len(mutual_nearest_neighbours(at(0), at(60), 0.9)[0]) == 1
 
 
-@pytest.mark.parametrize("has_integer_products", [True, False])
+@pytest.mark.usefixtures("computed")
 @pytest.mark.parametrize(("n", "m", "dim"), [(600, 520, 8), (257, 2, 128), (30, 1, 3), (5, 9, 1)])
-def test_pairs_under_a_ratio_are_those_of_the_definition(
-    monkeypatch: pytest.MonkeyPatch, n: int, m: int, dim: int, *, has_integer_products: bool
-) -> None:
-    if not has_integer_products:
-        monkeypatch.setattr(products, "_has_integer_products", lambda: False)
+def test_pairs_under_a_ratio_are_those_of_the_definition(n: int, m: int, dim: int) -> None:
     rng = np.random.default_rng(n)
     a, b = round_descriptors(unit_rows(rng, n, dim)), round_descriptors(unit_rows(rng, m, dim))
     i, j, similarity = mutual_nearest_neighbours(a, b)
