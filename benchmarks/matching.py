@@ -1,12 +1,12 @@
-"""Measure what matching a photo costs, in blocks of 256 rows and in blocks that fit a cache.
+"""Measure what matching a photo costs: by torch in blocks, and by compiled code.
 
     python -m benchmarks.matching MAP QUERY [--weights-dir DIR] [--photos 6] [--repeats 9]
 
 MAP is a folder of a map's versions, QUERY a kapture dataset. The descriptors of some of its photos
-are matched with those of the photos that the map retrieves: plainly, in blocks of 256 rows with
-NumPy's maxima as it was once done, and as the product does it. Both are asked in turn, and must
-find the same pairs. Prints a table in Markdown, in milliseconds of one thread's processor time per
-query: of each photo the least of its repeats, of the photos the median.
+are matched with those of the photos that the map retrieves: in torch, as on machines without
+compiled code, and compiled for each kind of processor that this one is. All are asked in turn, and
+must find the same nearest rows. Prints a table in Markdown, in milliseconds of one thread's
+processor time per query: of each photo the least of its repeats, of the photos the median.
 """
 
 from __future__ import annotations
@@ -20,80 +20,53 @@ from typing import Annotated
 import numpy as np
 import torch
 import typer
+from numpy.typing import NDArray
 
 from visloc.archive import MapStore
 from visloc.features import make_global_descriptor, make_local_features
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
 from visloc.localization.localizer import Localizer
-from visloc.matching.correspondences import Pairs, mutual_nearest_neighbours
-from visloc.matching.products import EightBitRows, block_rows, row_products
+from visloc.matching import compiled
+from visloc.matching.compiled import NearestColumns
+from visloc.matching.nearest import nearest_by_torch
+from visloc.matching.products import EightBitRows
 from visloc.options import LocalizeOptions
-
-ROWS_BEFORE = 256
-PARTS = ("products", "largest of each row", "largest of each column", "in all")
 
 # The descriptors of a query and those of each photo that it is matched with.
 Matched = tuple[EightBitRows, Sequence[EightBitRows]]
+Way = Callable[[NDArray[np.int8], NDArray[np.int8], bool], NearestColumns]
 
 
-def matched_plainly(a: EightBitRows, b: EightBitRows) -> Pairs:
-    """Do what ``mutual_nearest_neighbours`` does, in large blocks."""
-    products = row_products(a.rows, b.rows, ROWS_BEFORE)
-    best_b, best = np.empty(len(a), dtype=np.int64), np.empty(len(a), dtype=np.float64)
-    column_best = np.full(len(b), -np.inf)
-    for start in range(0, len(a), ROWS_BEFORE):
-        rows = slice(start, min(start + ROWS_BEFORE, len(a)))
-        similarity = products(rows).numpy()
-        np.argmax(similarity, axis=1, out=best_b[rows])
-        best[rows] = similarity[np.arange(len(similarity)), best_b[rows]]
-        np.maximum(column_best, similarity.max(axis=0), out=column_best)
-    mutual = np.flatnonzero(best == column_best[best_b])
-    _, first = np.unique(best_b[mutual], return_index=True)
-    mutual = mutual[np.sort(first)]
-    return mutual, best_b[mutual], (best[mutual] * (a.scale * b.scale)).astype(np.float32)
+def ways() -> dict[str, Way]:
+    """Return all ways of this machine by name."""
+    found: dict[str, Way] = {"torch": nearest_by_torch}
+    for level in range(1, compiled.level() + 1):
+        name = f"compiled, {compiled.PROCESSORS[level]}"
+        found[name] = partial(compiled.nearest_columns, at_level=level)
+    return found
 
 
-def parts(a: EightBitRows, b: EightBitRows, most_rows: int) -> list[float]:
-    """Return the seconds of each part but the last, in blocks of so many rows."""
-    products = row_products(a.rows, b.rows, most_rows)
-    seconds = np.zeros(3)
-    for start in range(0, len(a), most_rows):
-        times = [time.thread_time()]
-        block = products(slice(start, min(start + most_rows, len(a))))
-        times.append(time.thread_time())
-        block.numpy().argmax(axis=1)
-        times.append(time.thread_time())
-        block.amax(dim=0)
-        times.append(time.thread_time())
-        seconds += np.diff(times)
-    return [float(each) for each in seconds]
-
-
-def measure(matched: Matched, repeats: int) -> list[list[float]]:
-    """Return the least seconds of each of ``PARTS``, before and now, in turn.
+def measure(matched: Matched, repeats: int) -> list[float]:
+    """Return the least seconds of each way, asked in turn.
 
     Raises:
-        AssertionError: both find different pairs.
+        AssertionError: they find different rows.
     """
     query, photos = matched
-    for b in photos:
-        before, now = matched_plainly(query, b), mutual_nearest_neighbours(query, b)
-        for part in range(3):
-            assert np.array_equal(before[part], now[part])
-    ways: list[tuple[Callable[[EightBitRows, EightBitRows], Pairs], Callable[[int], int]]] = [
-        (matched_plainly, lambda _: ROWS_BEFORE),
-        (mutual_nearest_neighbours, block_rows),
-    ]
-    least = [[np.inf] * len(PARTS) for _ in ways]
+    for photo in photos:
+        found = [way(query.rows, photo.rows, False) for way in ways().values()]
+        for other in found[1:]:
+            assert np.array_equal(found[0].best, other.best)
+            assert np.array_equal(found[0].columns, other.columns)
+            assert np.array_equal(found[0].column_best, other.column_best)
+    least = [np.inf] * len(ways())
     for _ in range(repeats):
-        for way, (match, rows) in enumerate(ways):
+        for number, way in enumerate(ways().values()):
             start = time.thread_time()
-            for b in photos:
-                match(query, b)
-            whole = time.thread_time() - start
-            each = np.sum([parts(query, b, rows(len(b))) for b in photos], axis=0)
-            least[way] = [min(*pair) for pair in zip(least[way], [*each, whole], strict=True)]
+            for photo in photos:
+                way(query.rows, photo.rows, False)
+            least[number] = min(least[number], time.thread_time() - start)
     return least
 
 
@@ -115,7 +88,7 @@ def main(
     photos: int = 6,
     repeats: int = 9,
 ) -> None:
-    """Match in both ways, print."""
+    """Match in all ways, print."""
     opened = MapStore(map_folder.parent).open(map_folder.name)
     name = opened.manifest.local_features.fingerprint.name
     localizer = Localizer(
@@ -131,10 +104,12 @@ def main(
     keypoints = np.median([len(own) for own, _ in matched])
     landmarks = np.median([sum(map(len, seen)) for _, seen in matched])
     typer.echo(f"{name}: {keypoints:.0f} keypoints, {landmarks:.0f} landmarks of mapping photos")
-    typer.echo("| ms per query | blocks of 256 rows | blocks that fit the cache | ratio |")
+    typer.echo("| by | ms per query | torch's time / its own | GOP/s |")
     typer.echo("|---|---|---|---|")
-    for part, (before, now) in zip(PARTS, least.T, strict=True):
-        typer.echo(f"| {part} | {before:.1f} | {now:.1f} | {before / now:.2f} |")
+    dim = opened.manifest.local_features.descriptor_dim
+    for name, each in zip(ways(), least, strict=True):
+        rate = 2 * keypoints * landmarks * dim / each / 1e6
+        typer.echo(f"| {name} | {each:.1f} | {least[0] / each:.2f} | {rate:.0f} |")
 
 
 if __name__ == "__main__":

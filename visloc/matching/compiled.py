@@ -19,7 +19,7 @@ _LOGGER = logging.getLogger(__name__)
 LIBRARY = Path(__file__).with_name("native") / "nearest.so"
 _MOST_DIMENSIONS = 2**16 - 1  # sums fit 32 bits
 # What ``visloc_nearest_level`` returns.
-_PROCESSORS = {1: "AVX2", 2: "AVX-512 VNNI"}
+PROCESSORS = {1: "AVX2", 2: "AVX-512 VNNI"}
 
 
 class NearestColumns(NamedTuple):
@@ -77,7 +77,7 @@ def nearest_columns(
 
 @cache
 def level() -> int:
-    """Return the kind of processor that the library is used for, of ``_PROCESSORS``; 0: not used.
+    """Return which of ``PROCESSORS`` the library is used for; 0 if it is not used.
 
     The log says which. It is tried before it is used: a compiler may be wrong.
     """
@@ -87,9 +87,9 @@ def level() -> int:
     highest = int(_library().visloc_nearest_level())
     for each in range(highest, 0, -1):
         if _is_right(each):
-            _LOGGER.info("descriptors are matched by compiled code for %s", _PROCESSORS[each])
+            _LOGGER.info("descriptors are matched by compiled code for %s", PROCESSORS[each])
             return each
-        _LOGGER.warning("compiled code for %s gives wrong matches", _PROCESSORS[each])
+        _LOGGER.warning("compiled code for %s gives wrong matches", PROCESSORS[each])
     _LOGGER.info("descriptors are matched by torch: the processor has no AVX2")
     return 0
 

@@ -32,7 +32,7 @@ def nearest(a: NDArray[np.int8], b: NDArray[np.int8], *, with_second: bool) -> N
 
     Products are exact, so compiled code and torch give the same answer.
     """
-    find = compiled.nearest_columns if compiled.can_compare(a.shape[1]) else _by_blocks
+    find = compiled.nearest_columns if compiled.can_compare(a.shape[1]) else nearest_by_torch
     best, rows, second, column_best = find(a, b, with_second)
     # Equality with the column's maximum replaces a second, slower arg-max over the columns.
     mutual = np.flatnonzero(best == column_best[rows])
@@ -44,7 +44,7 @@ def nearest(a: NDArray[np.int8], b: NDArray[np.int8], *, with_second: bool) -> N
     )
 
 
-def _by_blocks(
+def nearest_by_torch(
     a: NDArray[np.int8], b: NDArray[np.int8], with_second: bool
 ) -> compiled.NearestColumns:
     """Make the products in blocks, and look through each twice while it is in a core's cache."""
