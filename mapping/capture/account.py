@@ -10,7 +10,7 @@ import numpy as np
 
 from mapping.capture.frames import FilmedVideo
 from mapping.capture.job import Captured
-from mapping.capture.trying import Trials
+from mapping.capture.trying import LOST_SIZE, Trials
 from mapping.report.cameras import disputed_focal_lengths
 from visloc.archive import Map
 
@@ -105,7 +105,8 @@ def verdict(trials: Trials, captured: Captured, opened: Map) -> str:
     share = _share_found(trials)
     grade = "good" if share >= _GOOD else ("usable" if share >= _USABLE else "poor")
     doubts = opened.manifest.parts.doubts
-    if doubts or len(opened.images) < _LEAST_IN_MAP * len(captured.photos):
+    is_doubted = any(doubt.kind != LOST_SIZE for doubt in doubts)
+    if is_doubted or len(opened.images) < _LEAST_IN_MAP * len(captured.photos):
         grade = "poor"
     elif grade == "good" and len(opened.images) < _MOST_IN_MAP * len(captured.photos):
         grade = "usable"
@@ -116,9 +117,10 @@ def verdict(trials: Trials, captured: Captured, opened: Map) -> str:
     )
     lines = [
         f"The map is {grade}: {len(opened.images)} of {len(captured.photos)} photos are in it.",
-        f"As a test, {len(trials.right)} of them were looked for in the map as if they and those "
-        f"beside them had not been taken: {int(trials.right.sum())} were found where they were "
-        "taken.",
+        f"As a test, {_each_of(len(trials.right), len(opened.images))} was hidden from the map "
+        f"together with its neighbours, and then looked for: {int(trials.right.sum())} of "
+        f"{len(trials.right)} were found where the map has them. (This does not measure whether "
+        "the map's shape is right.)",
         size,
         *_focal_lengths(opened),
         *(f"What speaks against it: {doubt.message}." for doubt in doubts),
@@ -126,12 +128,16 @@ def verdict(trials: Trials, captured: Captured, opened: Map) -> str:
     return " ".join(lines)
 
 
+def _each_of(tested: int, photos: int) -> str:
+    return "each photo" if tested == photos else f"each of {tested} photos"
+
+
 def _focal_lengths(opened: Map) -> list[str]:
     """Say what the own test cannot see: photos of one wrong focal length agree with each other."""
     return [
         f"Distances from the cameras to what they see may be {abs(found / used - 1):.0%} off: the "
-        f"map uses a focal length of {used:.0f} px, the photos fit {found:.0f} px best, and do not "
-        "tell which is right."
+        f"map uses a focal length of {used:.0f} px, but {found:.0f} px fit the photos best. They "
+        "do not tell which is right."
         for used, found in disputed_focal_lengths(opened)
         if abs(found / used - 1) > _FOCAL_OFF
     ]

@@ -19,7 +19,7 @@ from mapping.capture.markers import find_markers, grey_photos
 from mapping.capture.placing import Yardstick, place
 from mapping.capture.settings import CaptureSettings, KnownLength
 from mapping.capture.sources import Sources, find_sources, read_capture, study_videos
-from mapping.capture.trying import doubts_of_capture
+from mapping.capture.trying import doubts_of_capture, lost_size
 from mapping.cluster.stage_timings import Costs
 from mapping.cluster.storage import storage_failed
 from mapping.cluster.workers import Workers
@@ -30,7 +30,8 @@ from mapping.progress import Progress, not_told
 from mapping.stages.networks import Networks
 from mapping.stages.photos import collect_photos
 from mapping.stages.work_folder import WorkFolder, exclusive
-from visloc.archive import MapStore
+from visloc.archive import Map, MapStore
+from visloc.archive.schema import Doubt
 from visloc.errors import VislocError, refuse
 from visloc.features.local.readymade import is_ready_made
 from visloc.kapture import read_dataset
@@ -147,13 +148,18 @@ def capture_map(
         notes = write_imported(model, dataset)
         if marker_m is not None:
             yardstick = _with_markers(dataset, marker_m, progress)
+
+        def examine(opened: Map) -> tuple[Doubt, ...]:
+            of_capture = doubts_of_capture(opened, studied, _measured(yardstick))
+            return (*of_capture, *lost_size(opened, store))
+
         with _told_of_a_capture(notes):
             folder = build_map(
                 _build_settings(settings, model, dataset),
                 progress,
                 costs,
                 partial(place, yardstick),
-                partial(doubts_of_capture, films=studied, measured=_measured(yardstick)),
+                examine,
             )
     return Captured(folder, studied, names, notes, root)
 

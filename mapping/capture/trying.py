@@ -1,4 +1,4 @@
-"""Find doubts about a capture's map: photos that do not come back, films whose path jumps."""
+"""Find doubts about a capture's map: photos that do not come back, paths that jump, a lost size."""
 
 from __future__ import annotations
 
@@ -13,12 +13,15 @@ from mapping.own_test.verdict import LINKING_LANDMARKS, MAX_NAMES, MOST_APART
 from mapping.progress import ItemProgress
 from mapping.report.held_out import left_out_sets, localize_held_out, spread_photos
 from mapping.report.model import tolerance_of
-from visloc.archive import Map
+from visloc.archive import Map, MapStore
 from visloc.archive.schema import Doubt
+from visloc.errors import MapCorrupt, NotFound
 from visloc.geometry import Pose
 from visloc.localization.geometry.constraints import MapGeometry
 from visloc.pose.colmap import project
 
+LOST_SIZE = "size"
+"""The kind of a doubt about a map of unknown size that would replace one in metres."""
 _MOST_TRIED = 60
 # The path of a film jumps where its poses say that the picture moved by more than so many times
 # what was seen, and by so much of its longer side more. Seen is a median over tracked corners.
@@ -85,6 +88,26 @@ def doubts_of_capture(
         message = "the size rests on photos that do not come back where they were taken (--scale)"
         found.append(Doubt(kind="scale", message=message, photos=tuple(lost)))
     return tuple(found)
+
+
+def lost_size(opened: Map, store: MapStore) -> tuple[Doubt, ...]:
+    """Return a doubt about a map of unknown size if the version in use is in metres.
+
+    Whoever uses that version may count on metres.
+    """
+    if opened.manifest.world.metric:
+        return ()
+    try:
+        in_use = store.outline(opened.manifest.id)
+    except (NotFound, MapCorrupt):
+        return ()  # it would replace nothing that anybody can use
+    if not in_use.manifest.world.metric:
+        return ()
+    message = (
+        "the version in use is in metres, and the size of this one is not known: give --scale or "
+        "--marker-size again"
+    )
+    return (Doubt(kind=LOST_SIZE, message=message),)
 
 
 def _lost(opened: Map, measured: Sequence[str], astray: Sequence[str]) -> list[str]:

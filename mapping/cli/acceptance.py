@@ -1,4 +1,4 @@
-"""Messages about a version that its own test speaks against, and ``mapping use``."""
+"""Messages about a version in doubt, and ``mapping use``."""
 
 from __future__ import annotations
 
@@ -51,10 +51,12 @@ def require_acceptance(opened: Map, *, accept: bool, pictures: Path) -> None:
     for doubt in doubts:
         names = ", ".join(doubt.photos[:_SHOWN_NAMES])
         more = len(doubt.photos) - _SHOWN_NAMES
-        say(f"doubt: {doubt.message}: {names}" + (f" and {more} more" if more > 0 else ""))
-    pictures.mkdir(parents=True, exist_ok=True)
-    picture = pictures / f"{opened.manifest.id}-{opened.manifest.version}.png"
-    picture.write_bytes(draw_doubts(opened))
-    say(f"picture: {picture}")
+        about = f": {names}" + (f" and {more} more" if more > 0 else "") if names else ""
+        say(f"doubt: {doubt.message}{about}")
+    if any(doubt.photos for doubt in doubts):
+        pictures.mkdir(parents=True, exist_ok=True)
+        picture = pictures / f"{opened.manifest.id}-{opened.manifest.version}.png"
+        picture.write_bytes(draw_doubts(opened))
+        say(f"picture: {picture}")
     if not accept:
         raise refuse("map.doubtful", field="--accept", ref=opened.ref)

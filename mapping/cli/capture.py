@@ -49,7 +49,7 @@ def capture(
 
     Tells beforehand how long it takes. Tells afterwards what became of each second and photo, how
     good the map is, and what to film again. A map that its own test speaks against is not put into
-    use. Killed, the same command resumes.
+    use, nor one of unknown size in place of one in metres. Killed, the same command resumes.
     """
     costs = Costs()
     with StageProgress(ERR) as progress:

@@ -287,7 +287,7 @@ class Doubt(Record):
 
     Attributes:
         kind: ``own_test``, ``left_out``, ``pieces``, ``places`` or ``matches``; of a capture also
-            ``order`` or ``scale``.
+            ``order``, ``scale`` or ``size``.
         message: a sentence for people.
         photos: names of those that it is about, or of the first of them.
     """

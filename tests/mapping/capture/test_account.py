@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,6 +19,7 @@ from mapping.capture.picture import draw_walk
 from mapping.capture.trying import Trials, try_photos
 from mapping.capture.video import VideoFacts
 from mapping.methods.sparse.intrinsics import CAMERAS, CameraOrigin, Reason
+from visloc.archive.schema import Doubt
 
 
 class _Image:
@@ -131,8 +133,8 @@ def test_a_map_of_the_sample_is_judged_and_drawn(build_sample: Any, tmp_path: Pa
     names = [image.name for image in opened.images]
     text = verdict(trials, Captured(opened.path, {}, names, (), Path()), opened)
     assert f"{len(names)} of {len(names)} photos are in it" in text
-    assert f"As a test, {len(names)} of them were looked for" in text
-    assert f": {trials.right.sum()} were found where they were taken." in text
+    assert "As a test, each photo was hidden from the map together with its neighbours" in text
+    assert f": {trials.right.sum()} of {len(names)} were found where the map has them." in text
     assert "Its unit is a metre." in text
     target = tmp_path / "walk.png"
     draw_walk(opened, trials, target)
@@ -142,11 +144,11 @@ def test_a_map_of_the_sample_is_judged_and_drawn(build_sample: Any, tmp_path: Pa
         assert (picture[:1000] == colour).all(axis=2).sum() > 100
 
 
-def _manifest(**cameras: CameraOrigin) -> SimpleNamespace:
+def _manifest(doubts: Sequence[Doubt] = (), **cameras: CameraOrigin) -> SimpleNamespace:
     settings = {CAMERAS: {name: origin.model_dump() for name, origin in cameras.items()}}
     return SimpleNamespace(
         world=SimpleNamespace(metric=False),
-        parts=SimpleNamespace(doubts=()),
+        parts=SimpleNamespace(doubts=doubts),
         method=SimpleNamespace(settings=settings),
     )
 
@@ -166,7 +168,7 @@ def test_a_focal_length_that_the_photos_dispute_is_told(
     trials = Trials(np.arange(1), np.ones(1, np.bool_))
     text = verdict(trials, Captured(Path("map"), {}, ["a.jpg"], (), Path()), opened)
     assert (
-        "may be 34% off: the map uses a focal length of 424 px, the photos fit 570 px" in text
+        "may be 34% off: the map uses a focal length of 424 px, but 570 px fit the photos" in text
     ) is said
     assert ("focal length" in text) is said
 
@@ -182,3 +184,24 @@ def test_a_map_that_lost_photos_is_not_good(placed: int, grade: str) -> None:
     text = verdict(trials, Captured(Path("map"), {}, names, (), Path()), opened)
     assert f"The map is {grade}: {placed} of 4 photos" in text
     assert "Its size is not known" in text
+
+
+@pytest.mark.parametrize(("kind", "grade"), [("size", "good"), ("order", "poor")])
+def test_a_lost_size_makes_no_poor_map_but_is_told(kind: str, grade: str) -> None:
+    names = ["a.jpg", "b.jpg"]
+    opened: Any = _Opened(names)
+    opened.manifest = _manifest([Doubt(kind=kind, message="the size of this one is not known")])
+    trials = Trials(np.arange(2), np.ones(2, np.bool_))
+    text = verdict(trials, Captured(Path("map"), {}, names, (), Path()), opened)
+    assert f"The map is {grade}" in text
+    assert "What speaks against it: the size of this one is not known." in text
+
+
+def test_where_not_all_photos_are_tried_their_number_is_told() -> None:
+    names = ["a.jpg", "b.jpg", "c.jpg"]
+    opened: Any = _Opened(names)
+    opened.manifest = _manifest()
+    trials = Trials(np.array([0, 2]), np.array([True, False]))
+    text = verdict(trials, Captured(Path("map"), {}, names, (), Path()), opened)
+    assert "As a test, each of 2 photos was hidden" in text
+    assert "1 of 2 were found where the map has them. (This does not measure" in text

@@ -93,8 +93,10 @@ def test_photos_that_do_not_join_are_refused_with_what_to_film_and_what_was_left
 ) -> None:
     photos = tmp_path / "photos"
     photos.mkdir()
-    for seed in range(2):
-        cv2.imwrite(str(photos / f"{seed}.png"), texture(320, 240, seed))
+    # Of another scale: two textures have corners at the same pixels, which match by chance.
+    other = cv2.resize(texture(107, 80, seed=1), (320, 240))
+    for name, picture in (("0.png", texture(320, 240)), ("1.png", other)):
+        cv2.imwrite(str(photos / name), picture)
     (photos / "broken.jpg").write_bytes(b"no photo")
     with pytest.raises(InvalidInput) as refused:
         capture_map(CaptureSettings([photos], "room", tmp_path / "maps"), quiet, quiet)
@@ -102,6 +104,33 @@ def test_photos_that_do_not_join_are_refused_with_what_to_film_and_what_was_left
     assert "overlaps the next" in str(refused.value)
     assert "--pairs" not in str(refused.value)
     assert any("broken.jpg" in note for note in refused.value.__notes__)
+
+
+@pytest.mark.parametrize("known_before", [True, False])
+def test_a_map_of_unknown_size_is_in_doubt_where_one_in_metres_is_in_use(
+    make_video: Callable[..., Path],
+    maps_dir: Path,
+    tmp_path: Path,
+    monkeypatch: Any,
+    known_before: bool,
+) -> None:
+    in_metres = MapStore(maps_dir).open("room")
+    world = in_metres.manifest.world.model_copy(update={"metric": False})
+    sizeless = replace(in_metres, manifest=in_metres.manifest.model_copy(update={"world": world}))
+    doubts: list[Any] = []
+
+    def examined(*given: Any) -> Path:
+        *_, examine = given
+        doubts.extend(examine(sizeless))
+        assert examine(in_metres) == ()
+        return in_metres.path
+
+    monkeypatch.setattr(job, "build_map", examined)
+    maps = maps_dir if known_before else tmp_path / "no-maps"
+    settings = CaptureSettings([make_video(panned(20, 12))], "room", maps, force=True)
+    capture_map(settings, quiet, quiet)
+    assert [doubt.kind for doubt in doubts] == (["size"] if known_before else [])
+    assert all("--scale or --marker-size" in doubt.message for doubt in doubts)
 
 
 @pytest.mark.parametrize("missing", ["local_features", "global_features"])

@@ -21,6 +21,7 @@ from mapping.own_test.publishing import publish_edited
 from mapping.own_test.trials import OwnTestRun, run_own_test
 from mapping.own_test.verdict import doubts_about, misses_own_photos
 from visloc.archive import Map, MapStore, OwnTest, open_map
+from visloc.archive.schema import Doubt
 from visloc.errors import Conflict, InvalidInput, NotFound
 from visloc.geometry import Pose
 from visloc.kapture import read_dataset, write_dataset
@@ -202,6 +203,21 @@ def test_what_is_accepted_keeps_its_doubts(broken: Path, maps_dir: Path, tmp_pat
     assert MapStore(maps_dir).current_version("room") == opened.manifest.version
     assert opened.manifest.parts.doubts
     require_acceptance(opened, accept=True, pictures=tmp_path)
+
+
+def test_a_doubt_about_no_photo_in_particular_is_told_without_a_picture(
+    maps_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    opened = MapStore(maps_dir).open("room")
+    parts = opened.manifest.parts.model_copy(
+        update={"doubts": (Doubt(kind="size", message="its size is not known"),)}
+    )
+    opened = replace(opened, manifest=opened.manifest.model_copy(update={"parts": parts}))
+
+    with pytest.raises(Conflict, match="mapping use room@"):
+        require_acceptance(opened, accept=False, pictures=tmp_path / "pictures")
+    assert capsys.readouterr().out == "doubt: its size is not known\n"
+    assert not (tmp_path / "pictures").exists()
 
 
 def test_a_good_build_is_put_into_use(maps_dir: Path) -> None:
