@@ -26,6 +26,8 @@ from visloc.retrieval.fusion import EQUAL_GHARM
 
 OUT = Console()
 ERR = Console(stderr=True)
+# Of the landmarks, on each side: some lie far outside of what was filmed.
+_STRAYS, _MOST_LANDMARKS = 0.02, 100_000
 # More lines than anyone reads.
 _SHOWN_RESIDUALS = 20
 
@@ -86,8 +88,6 @@ def print_map(opened: Map) -> None:
     """Print the contents of a map."""
     summary = summary_of(opened)
     counts, local = summary["counts"], summary["local_features"]
-    extent = summary["world"]["extent"]
-    sides = [high - low for low, high in zip(extent["min"], extent["max"], strict=True)]
     table = Table(show_header=False, box=None, title=f"map {opened.ref}", title_justify="left")
     rows = {
         "photos": f"{counts['images']} by {summary['cameras']} cameras",
@@ -103,8 +103,7 @@ def print_map(opened: Map) -> None:
             f"{g['fingerprint']['name']} ({g['dim']})" for g in summary["global_features"]
         ),
         **_retrieval(opened),
-        "extent": " x ".join(f"{side:.2f}" for side in sides)
-        + (" m" if summary["world"]["metric"] else " (not metric)"),
+        "extent": _extent(opened),
         "world": _world(opened),
         "gravity": gravity_text(opened.gravity),
         "place": place_text(opened.place) + _scale(opened),
@@ -132,6 +131,25 @@ def _landmarks(summary: Mapping[str, Any]) -> str:
     )
 
 
+def _extent(opened: Map) -> str:
+    """Return the sides of the box of the landmarks, without the few that lie far outside."""
+    box = opened.manifest.world.extent
+    low, high = np.array(box.min), np.array(box.max)
+    unit = " m" if opened.manifest.world.metric else " (not metric)"
+    if not opened.has_landmarks:
+        return _sides(high - low) + unit
+    landmarks = opened.landmarks[:: max(1, len(opened.landmarks) // _MOST_LANDMARKS)]
+    inner = np.quantile(landmarks.astype(np.float64), [_STRAYS, 1 - _STRAYS], axis=0)
+    return (
+        f"{_sides(inner[1] - inner[0])}{unit} without the outermost landmarks, "
+        f"{_sides(high - low)} with them"
+    )
+
+
+def _sides(lengths: NDArray[np.float64]) -> str:
+    return " x ".join(f"{length:.2f}" for length in lengths)
+
+
 def print_pieces(store: MapStore, largest: Map) -> None:
     """Print the maps that the same build made of photos that nothing links to the largest map."""
     for ref in pieces_of(largest.manifest):
@@ -155,22 +173,33 @@ def _retrieval(opened: Map) -> dict[str, str]:
 
 
 def _world(opened: Map) -> str:
-    """Return whether a unit is a metre, and what fixed the frame."""
-    world = opened.manifest.world
+    """Return whether a unit is a metre, what told that, and what fixed the frame."""
+    world, anchor = opened.manifest.world, opened.manifest.world.anchor
     kind, unit = ("metric", "m") if world.metric else ("not metric", "units")
-    if world.anchor is None:
+    size = _source_of_size(opened)
+    if size:
+        kind += f", size from {size}"
+    if anchor is None:
         return kind
-    anchor = world.anchor
+    if anchor.kind == "none":
+        arbitrary = "origin and directions" if world.metric else "origin, directions and size"
+        return f"{kind}; {arbitrary} are arbitrary"
     fixed_by = {
         "dataset": "the poses of the dataset",
         "model": "the imported reconstruction",
         "gnss": f"GNSS fixes of {anchor.images} photos",
         "positions": f"known positions of {anchor.images} photos",
         "correspondences": f"{anchor.images} given points" if anchor.images else "a given place",
-        "none": "nothing: the frame is arbitrary",
     }[anchor.kind]
     off = "" if anchor.rms is None else f", which agree within {anchor.rms:.2g} {unit} (RMS)"
     return f"{kind}, fixed by {fixed_by}{off}"
+
+
+def _source_of_size(opened: Map) -> str:
+    """Return the option of `mapping capture` that told the map's unit; empty without."""
+    scale = opened.manifest.method.settings.get("scale")
+    told_by = scale.get("by") if isinstance(scale, dict) else None
+    return {"length": "--scale", "markers": "--marker-size"}.get(str(told_by), "")
 
 
 def gravity_text(down: NDArray[np.float64] | None) -> str:
