@@ -161,7 +161,6 @@ RULES = (
     Rule(Tier.PARSED, r"map-sets", r"mapping (set|split)", _PLACES),
     Rule(Tier.PARSED, r"mapping\.md", r"mapping capture", "the tutorial runs it"),
     Rule(Tier.PARSED, r"your-app", r"visloc-service .*cors", "test_web_overlay.py"),
-    Rule(Tier.PARSED, r"your-room", r".* PHOTOS ", "minutes more; tests/mapping/capture"),
     Rule(
         Tier.PARSED,
         r"mapping\.md",
@@ -203,7 +202,7 @@ RULES = (
 )
 PROGRAMS = (
     *("mapping", "localize", "visloc-service", "python", "make"),
-    *("curl", "cp", "sed", "openssl", "printf", "node", "npm"),
+    *("curl", "cp", "mkdir", "sed", "openssl", "printf", "node", "npm"),
 )
 
 
