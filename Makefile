@@ -20,6 +20,7 @@ install: $(INSTALLED) page ## make .venv with every extra, and the page where No
 $(INSTALLED): pyproject.toml constraints.txt hatch_build.py $(wildcard visloc/matching/native/*.[ch])
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "visloc needs Python 3.11 or newer")'
 	$(PYTHON) -m venv $(VENV)
+	@echo 'Installing everything into $(VENV): about 3.5 GB, and five minutes in which nothing is printed.' >&2
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt \
 		--editable '.[mapping,service,gem,s3,cluster,tracing,clients,compare,ros,dev]'
 	touch $(INSTALLED)
