@@ -84,7 +84,11 @@ def level() -> int:
     if not LIBRARY.exists():
         _LOGGER.info("descriptors are matched by torch, not by compiled code: it was not built")
         return 0
-    highest = int(_library().visloc_nearest_level())
+    try:
+        highest = int(_library().visloc_nearest_level())
+    except OSError as error:  # it was built for another system
+        _LOGGER.warning("descriptors are matched by torch, not by compiled code: %s", error)
+        return 0
     for each in range(highest, 0, -1):
         if _is_right(each):
             _LOGGER.info("descriptors are matched by compiled code for %s", PROCESSORS[each])

@@ -104,6 +104,18 @@ def test_code_that_finds_wrong_products_is_not_used(
     assert "gives wrong matches" in caplog.text
 
 
+def test_a_library_of_another_system_is_not_used(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "nearest.so").write_bytes(b"\x7fELF of another system")
+    monkeypatch.setattr(compiled, "LIBRARY", tmp_path / "nearest.so")
+    compiled._library.cache_clear()
+    with caplog.at_level(logging.WARNING, compiled.__name__):
+        assert compiled.level() == 0
+    compiled._library.cache_clear()
+    assert f"not by compiled code: {tmp_path}" in caplog.text
+
+
 def test_without_it_torch_finds_the_same(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
