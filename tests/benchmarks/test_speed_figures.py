@@ -46,7 +46,12 @@ def measured() -> Measured:
         "seconds": {"local features": 50.0, "depth": 0.5, "landmarks": 0.25, "archive": 0.25},
         "counts": {"observations": 2000, "images": 10},
     }
-    rates = {"product_int8": 1e9, "convolution_fp32": 1e11, "convolution_int8": 4e11}
+    rates = {
+        "product_fp32": 5e8,
+        "product_int8": 1e9,
+        "convolution_fp32": 1e11,
+        "convolution_int8": 4e11,
+    }
     about = {"descriptor_dim": 128, "megapixels": 1.0}
     described = {
         way.label: {**about, "computed_with": "fp32" if way.label == TORCH else "int8"}
