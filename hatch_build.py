@@ -1,6 +1,6 @@
 """Compiles what is written in C, where there is a C compiler, while the package is installed.
 
-Without a compiler, or on another kind of machine, the package is the same but for that library:
+Without a compiler, or on another kind of machine, the package lacks only that library:
 ``visloc.matching`` then computes with torch, and says so in its log.
 """
 
@@ -22,10 +22,10 @@ FOLDER = Path("visloc/matching/native")
 OPTIONS = ("-std=gnu11", "-O2", "-fPIC", "-shared")
 
 
-class CompilingBuildHook(BuildHookInterface):  # type: ignore[type-arg]
+class CompilingBuildHook(BuildHookInterface[Any]):
     """Adds the library to a wheel, which then is for this kind of machine only."""
 
-    def initialize(self, version: str, build_data: dict[str, Any]) -> None:  # noqa: ARG002
+    def initialize(self, version: str, build_data: dict[str, Any]) -> None:  # noqa: ARG002  hatch's
         if self.target_name != "wheel" or (sys.platform, platform.machine()) != ("linux", "x86_64"):
             return
         compiler = shlex.split(os.environ.get("CC", "cc"))

@@ -1,4 +1,4 @@
-"""What a photo costs alone, on a rig and in a sequence (docs/performance.md).
+"""Time photos that are sent alone, on a rig and in a sequence (docs/performance.md).
 
     python -m benchmarks.speed.together MAPS_DIR MAP QUERY RIG [--time-unit ms]
 

@@ -1,4 +1,4 @@
-"""What matching costs, on the sample: the command itself checks that all ways find equal rows."""
+"""The benchmark of matching runs on the sample, and itself checks that all ways find equal rows."""
 
 from __future__ import annotations
 
