@@ -23,6 +23,7 @@ from visloc.features.weights.files import (
     check_shapes,
     read_weights,
 )
+from visloc.features.weights.torch_file import _KNOWN
 
 OLD_START = pickle.dumps(0x1950A86A20F9469CFC6C, 2) + pickle.dumps(1001, 2)
 SYSTEM_INFO = pickle.dumps({"protocol_version": 1001, "little_endian": True}, 2)
@@ -58,7 +59,7 @@ def _zip_file(
     return path
 
 
-NO_STORAGE = "storage key '7' not found"  # of the older layout, where nothing uses it
+NO_STORAGE = "storage 7, which no tensor uses"  # of the older layout, where nothing uses it
 WRITERS = pytest.mark.parametrize("write", [_old_file, _zip_file])
 Writer = Callable[[Path, bytes], Path]
 
@@ -168,24 +169,24 @@ def test_names_beside_the_known_ones_are_refused(
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
-        (_dict_of(_tensor(size=3)), "resize storage|wrong byte size"),
-        (_dict_of(_tensor(offset=1)), "resize storage|wrong byte size"),
-        (_dict_of(_tensor(length=200)), "record size|wrong byte size"),
+        (_dict_of(_tensor(size=3)), "reaches beyond its storage|another size"),
+        (_dict_of(_tensor(offset=1)), "reaches beyond its storage|another size"),
+        (_dict_of(_tensor(length=200)), "8 bytes for 200 numbers|another size"),
         (_dict_of(b"K\x01"), f"holds int|{NO_STORAGE}"),
         (b"\x80\x02}.", f"no state dict|{NO_STORAGE}"),
         (b"\x80\x02K\x05.", f"no state dict|{NO_STORAGE}"),
-        (b"\x80\x02.", "empty list"),
+        (b"\x80\x02.", "stack underflow|pop from empty"),
         (b"\x80\x02}", "exhausted|unknown"),
         (b"\x80\x03}.", "not a pickle of protocol 2"),
         # a terabyte of zeros
         (_dict_of(b"c__builtin__\nbytearray\n\x8a\x06" + bytes(5) + b"\x01\x85R"), "no name"),
-        # a memo entry that would make Python's own unpickler allocate tens of gigabytes
-        (b"\x80\x02}r\xf0\xff\xff\xff.", f"no state dict|{NO_STORAGE}"),
+        # a memo entry that would make Python's unpickler allocate tens of gigabytes
+        (b"\x80\x02}r\xf0\xff\xff\xff.", "memo entry 4294967280"),
         (_dict_of(b"X\xff\xff\xff\x7fabc"), "only"),
         (_dict_of(b"\x8d" + b"\xff" * 8), "byte count"),
         (_dict_of(b"\x8e" + b"\xff" * 7 + b"\x00"), "only"),
         (_dict_of(b"cbuiltins\nlist\n(]tR"), f"holds Pickled|{NO_STORAGE}"),
-        (_dict_of(b"ccollections\nOrderedDict\n(]tR"), f"holds OrderedDict|{NO_STORAGE}"),
+        (_dict_of(b"ccollections\nOrderedDict\n(]tR"), f"holds Dict|{NO_STORAGE}"),
         # one list copied again and again, a few bytes each
         (
             b"\x80\x02ccollections\nOrderedDict\nq\x00]q\x01("
@@ -208,6 +209,42 @@ def test_malformed_content_is_refused_with_the_reason(
         read_checkpoint(write(tmp_path / "w.pt", content))
     assert caught.value.code == "weights.format"
     assert str(tmp_path / "w.pt") in str(caught.value)
+
+
+@WRITERS
+@pytest.mark.parametrize(
+    "call",
+    [
+        b"X\x07\x00\x00\x00_codecsX\x06\x00\x00\x00encode\x93X\x00\x00\x00\x00X\x03\x00\x00\x00hex\x86R",
+        b"(X\x00\x00\x00\x00X\x03\x00\x00\x00heximd5\n_codecs\nencode\n",
+        b"\x82\x01",
+        b"\x96\xff\xff\xff\xff\xff\xff\xff\x00",
+    ],
+)
+def test_other_ways_to_name_and_to_make_things_are_refused(
+    call: bytes, write: Writer, tmp_path: Path
+) -> None:
+    with pytest.raises(WeightsError, match="does not hold complete, plain tensors"):
+        read_checkpoint(write(tmp_path / "w.pt", _dict_of(call)))
+
+
+@WRITERS
+@pytest.mark.parametrize("kind", [b"O", b"<i2", b"S9", b"(9,)f4", b"<f4,<f4"])
+def test_numbers_are_of_no_other_type(kind: bytes, write: Writer, tmp_path: Path) -> None:
+    text = b"X" + struct.pack("<I", len(kind)) + kind
+    content = _dict_of(_tensor().replace(b"ctorch\nFloatStorage\n", text))
+    with pytest.raises(WeightsError, match="named as torch names none"):
+        read_checkpoint(write(tmp_path / "w.pt", content))
+
+
+@pytest.mark.parametrize("name", sorted(_KNOWN))
+@pytest.mark.parametrize("state", [b"}X\x01\x00\x00\x00aNs", b"N}X\x01\x00\x00\x00aNs\x86"])
+def test_a_file_cannot_change_what_names_stand_for(name: str, state: bytes, tmp_path: Path) -> None:
+    module, _, rest = name.rpartition(".")
+    content = _dict_of(f"c{module}\n{rest}\n".encode() + state + b"b")
+    with pytest.raises(WeightsError):
+        read_checkpoint(_zip_file(tmp_path / "w.pt", content))
+    assert not hasattr(_KNOWN[name], "a")
 
 
 @WRITERS
@@ -240,7 +277,6 @@ def test_storage_shorter_than_it_says_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("keys", [[], ["6"], [["7"]], ("7",), {"6": "7"}])
 def test_storage_whose_numbers_are_not_there_is_refused(keys: object, tmp_path: Path) -> None:
-    """torch would hand it out as it found the memory."""
     path = _old_file(tmp_path / "w.pt", _dict_of(_tensor()))
     path.write_bytes(path.read_bytes().replace(pickle.dumps(["7"], 2), pickle.dumps(keys, 2)))
     with pytest.raises(WeightsError, match="does not hold complete, plain tensors"):

@@ -264,8 +264,8 @@ def test_bytes_asked_for_again_and_again_take_no_memory(tmp_path: Path) -> None:
         _ENCODE * 31 + _string(b"a" * 1000) + (_string(b"hex") + b"\x86R") * 31,
         _ENCODE + _string(b"abcd") + _string(b"rot13") + b"\x86R",
         _ENCODE + _string(b"a" * 1000) + _string(b"utf-32") + b"\x86R",
-        _ENCODE + b"q\x01q\x02" + _string(b"a") + _string(b"latin1") + b"\x86R0"
-        b"h\x02" + _string(b"a") + _string(b"hex") + b"\x86R",
+        _ENCODE + b"q\x01q\x02" + _string(b"a") + _string(b"latin1") + b"\x86R"
+        b"h\x02" + _string(b"a") + _string(b"hex") + b"\x86R\x86",
         _ENCODE + _string(b"a") + _string(b"latin1") + _string(b"hex") + b"\x86\x86R",
     ],
 )
