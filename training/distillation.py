@@ -20,6 +20,7 @@ from training.conditions import Conditions
 from training.pairs import Pairs, Sources, as_numbers, draw, from_numbers, photograph
 from training.settings import Settings
 from visloc.features.networks.xfeat.model import read_published
+from visloc.features.networks.xfeat.torch import XFeatModule
 
 _TEMPERATURE = 0.1  # of the softmax over cosines
 _SAME_PLACE_PX = 8.0  # closer places are no wrong answers: they share a cell
@@ -39,7 +40,7 @@ class Distillation:
     def __init__(self, settings: Settings, sources: Sources) -> None:
         self._settings, self._sources = settings, sources
         teacher, _ = read_published(None)
-        self._teacher = teacher.to(sources.device)
+        self._teacher = XFeatModule(teacher).to(sources.device)
         # The batch norms stay inside the convolutions: a night's statistics are not a day's.
         self.network = deepcopy(self._teacher).requires_grad_(True)
         self._like = draw(sources, settings, 0)

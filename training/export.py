@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from training.checkpoint import State
 from training.files import write_tensors
@@ -17,6 +17,7 @@ from training.network import ARCHITECTURES, TrainableR2D2
 from visloc.errors import refuse
 from visloc.features.networks.r2d2 import model as r2d2
 from visloc.features.networks.xfeat import model as xfeat
+from visloc.features.networks.xfeat.torch import XFeatModule
 
 Arrays = Mapping[str, NDArray[Any]]
 
@@ -47,18 +48,18 @@ def _from_scratch(state: State) -> tuple[Arrays, dict[str, str]]:
     trained = TrainableR2D2(ARCHITECTURES[state.settings.architecture])
     trained.load_state_dict(state.network)
     network = trained.folded()
-    _check_range({f"convolutions.{n}": c.weight for n, c in enumerate(network.convolutions())})
+    _check_range({f"convolutions.{n}": c.weight for n, c in enumerate(network.convolutions)})
     words = {"format": "visloc folded R2D2, version 1", "licence": "BSD-3-Clause"}
     return r2d2.pack(network), words
 
 
 def _distilled(state: State) -> tuple[Arrays, dict[str, str]]:
-    with torch.device("meta"):
-        network = xfeat.XFeatNetwork().fuse()
-    network.load_state_dict(state.network, assign=True)
-    _check_range({name: value for name, value in state.network.items() if "weight" in name})
-    _, teacher_sha256 = xfeat.read_published(None)
-    return xfeat.pack(network.requires_grad_(False)), {
+    teacher, teacher_sha256 = xfeat.read_published(None)
+    student = XFeatModule(teacher)
+    student.load_state_dict(state.network)
+    network = student.network()
+    _check_range({name: each for name, each in network.arrays().items() if "weight" in name})
+    return xfeat.pack(network), {
         "format": "visloc fused XFeat, version 1",
         "licence": "Apache-2.0",
         "changed": "fine-tuned by visloc from the weights of XFeat (Potje et al. 2024)",
@@ -66,9 +67,9 @@ def _distilled(state: State) -> tuple[Arrays, dict[str, str]]:
     }
 
 
-def _check_range(weights: Mapping[str, Tensor]) -> None:
+def _check_range(weights: Arrays) -> None:
     for name, weight in weights.items():
-        largest = float(weight.abs().max())
+        largest = float(np.abs(weight).max())
         if not largest < _LARGEST_HALF:
             raise refuse(
                 "training.range", field=name, expected=f"less than {_LARGEST_HALF}", got=largest

@@ -6,15 +6,16 @@ of the one that was trained here.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
+from numpy.typing import NDArray
 from torch import Tensor, nn
-from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from training.interpolation import weighted_squares
-from visloc.features.backends.torch import for_inference
+from visloc.features.backends.convolution import folded
 from visloc.features.networks.r2d2.model import (
     DESCRIPTOR_DIM,
     FAST_R2D2,
@@ -25,6 +26,7 @@ from visloc.features.networks.r2d2.model import (
     R2D2Network,
 )
 
+Array = NDArray[Any]
 ARCHITECTURES = {each.name: each for each in (R2D2, FAST_R2D2)}
 
 
@@ -71,10 +73,14 @@ class TrainableR2D2(nn.Module):
         super().__init__()
         self.architecture = architecture
         convolutions, batch_norms = [], []
-        for layer, convolution in architecture.convolutions():
-            convolutions.append(convolution)
+        shapes = architecture.weight_shapes()
+        for layer, (outputs, inputs, kernel, _) in zip(architecture.layers, shapes, strict=True):
+            dilation, padding = layer.dilation, layer.padding
+            convolutions.append(
+                nn.Conv2d(inputs, outputs, kernel, dilation=dilation, padding=padding)
+            )
             if layer.normalized:
-                batch_norms.append(nn.BatchNorm2d(convolution.out_channels, affine=False))
+                batch_norms.append(nn.BatchNorm2d(outputs, affine=False))
         self.convolutions = nn.ModuleList(convolutions)
         self.batch_norms = nn.ModuleList(batch_norms)
         self.heads = nn.Conv2d(DESCRIPTOR_DIM, 2, 1)
@@ -86,16 +92,15 @@ class TrainableR2D2(nn.Module):
 
     def folded(self) -> R2D2Network:
         """Return the network for inference, the batch norms inside the convolutions."""
-        self.double().eval()
-        network = R2D2Network(self.architecture).fuse()
-        convolutions = [each for each in self.convolutions if isinstance(each, nn.Conv2d)]
-        for number, batch_norm in enumerate(self.batch_norms):
-            assert isinstance(batch_norm, nn.BatchNorm2d)
-            convolutions[number] = fuse_conv_bn_eval(convolutions[number], batch_norm)
-        for ours, trained in zip(network.convolutions(), convolutions, strict=True):
-            ours.load_state_dict(trained.state_dict(), assign=True)
-        network.heads.load_state_dict(self.heads.state_dict(), assign=True)
-        return for_inference(network)
+        arrays = {name: tensor.cpu().numpy() for name, tensor in self.state_dict().items()}
+        pairs = []
+        for number, layer in enumerate(self.architecture.layers):
+            pair = _pair(arrays, f"convolutions.{number}")
+            pairs.append(
+                folded(*pair, arrays, f"batch_norms.{number}") if layer.normalized else pair
+            )
+        weight, bias = _pair(arrays, "heads")
+        return R2D2Network.of(self.architecture, [*pairs, (weight[:, :, 0, 0], bias)])
 
     def features(self, images: Tensor) -> Tensor:
         """Return x (B, 128, H // stride, W // stride) for RGB (B, 3, H, W) in 0 to 1."""
@@ -128,3 +133,7 @@ class TrainableR2D2(nn.Module):
             torch.sigmoid(reliability + bias[0]),
             softplus / (1 + softplus),
         )
+
+
+def _pair(arrays: Mapping[str, Array], name: str) -> tuple[Array, Array]:
+    return arrays[f"{name}.weight"], arrays[f"{name}.bias"]

@@ -14,10 +14,15 @@ if TYPE_CHECKING:
 _CUDA_DEVICES = (Path("/dev/nvidiactl"), Path("/dev/dxg"), Path("/dev/nvhost-gpu"))
 
 
+def may_have_cuda() -> bool:
+    """Return whether there is the driver of a CUDA GPU, without loading torch."""
+    return any(device.exists() for device in _CUDA_DEVICES)
+
+
 @cache
 def has_cuda() -> bool:
     """Return whether this process sees a CUDA GPU; ``CUDA_VISIBLE_DEVICES`` says which it sees."""
-    if not any(device.exists() for device in _CUDA_DEVICES):
+    if not may_have_cuda():
         return False
     import torch
 

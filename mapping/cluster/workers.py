@@ -17,12 +17,12 @@ from contextlib import contextmanager
 from functools import partial
 from typing import TypeVar
 
-import cv2
 from threadpoolctl import threadpool_limits
 
 from mapping.cluster.stage_timings import Spent, spent_here
 from mapping.progress import ItemProgress, Progress
 from visloc.errors import refuse
+from visloc.threads import threads
 
 S = TypeVar("S")
 T = TypeVar("T")
@@ -39,8 +39,7 @@ ONE_THREAD = {
     "OPENCV_FOR_THREADS_NUM": "1",
 }
 
-# What the tasks of a build need. Networks and matching need torch.
-_PRELOADED = ("mapping.build.build", "torch")
+_PRELOADED = "mapping.build.build"  # what the tasks of a build need
 
 # The server's socket lies below the folder of temporary files. Its path has at most 107 bytes, of
 # which multiprocessing appends 32.
@@ -54,9 +53,7 @@ class Workers:
     """An ``Executor`` of ``count`` processes, which end with the ``with`` block; 1: this process.
 
     A single item is done in this process as well: Ctrl-C then ends it at once, and it can report
-    progress. Every process uses one thread, so that their number does not change the result. Only
-    if a task of this process is the first to load torch, torch uses all threads: for products of
-    integers, which are the same with any number of threads.
+    progress. Every process uses one thread, so that their number does not change the result.
     """
 
     def __init__(self, count: int) -> None:
@@ -153,7 +150,8 @@ def _start_method() -> multiprocessing.context.BaseContext:
     if len(os.fsencode(tempfile.gettempdir())) > _LONGEST_TEMPORARY:
         return multiprocessing.get_context("spawn")
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(list(_PRELOADED))
+    # Where this process has loaded torch for its networks, the others need it too.
+    context.set_forkserver_preload([_PRELOADED, *({"torch"} & sys.modules.keys())])
     return context
 
 
@@ -231,19 +229,8 @@ def _interrupted_later() -> Iterator[None]:
 @contextmanager
 def one_thread_here() -> Iterator[None]:
     """Compute like a worker: the number of threads changes the last bits of results."""
-    # Do not load torch here: it takes seconds. A network that needs it has loaded it already.
-    torch = sys.modules.get("torch")
-    before = cv2.getNumThreads(), torch.get_num_threads() if torch else 0
-    cv2.setNumThreads(1)
-    if torch:
-        torch.set_num_threads(1)
-    try:
-        with threadpool_limits(1, user_api="blas"):  # of NumPy and SciPy
-            yield
-    finally:
-        cv2.setNumThreads(before[0])
-        if torch:
-            torch.set_num_threads(before[1])
+    with threads(1), threadpool_limits(1, user_api="blas"):  # of NumPy and SciPy
+        yield
 
 
 @contextmanager

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import gc
+import importlib
 import signal
 
 import service.workers.vision  # noqa: F401  loaded once, for all of them
+from visloc.features.backends.choice import is_torch_sure
+
+if is_torch_sure():
+    importlib.import_module("torch")
 
 # A signal to the group of processes is for the main process, which lets requests end.
 signal.signal(signal.SIGTERM, signal.SIG_IGN)

@@ -7,6 +7,7 @@ import os
 import pickle
 import signal
 import threading
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing import parent_process
@@ -62,18 +63,20 @@ def serve(connection: Connection, settings: WorkerSettings, abandoned: ctypes.c_
     threading.Thread(target=_end_with_parent, daemon=True).start()
     if settings.configure_logging is not None:
         settings.configure_logging()
-    from service.workers.vision import Vision  # not in the main process, which has this module too
+    # Not in the main process, which has this module too.
+    from service.workers.vision import Vision
+    from visloc.threads import use_threads
 
     vision = Vision(settings, abandoned)
     with suppress(EOFError, OSError):  # of the connection
         while True:
-            connection.send_bytes(_reply_to(connection.recv_bytes(), vision))
+            connection.send_bytes(_reply_to(connection.recv_bytes(), vision, use_threads))
 
 
-def _reply_to(message: bytes, vision: Vision) -> bytes:
+def _reply_to(message: bytes, vision: Vision, use_threads: Callable[[int], None]) -> bytes:
     try:
         task, threads = pickle.loads(message)
-        vision.use_threads(threads)
+        use_threads(threads)
         reply = Reply(task(vision), vision.open_maps)
         return pickle.dumps(reply, pickle.HIGHEST_PROTOCOL)
     except BaseException as error:  # noqa: BLE001  whatever it is, the main process gets it

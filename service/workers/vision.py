@@ -12,9 +12,7 @@ from dataclasses import replace
 from time import perf_counter, time
 from typing import Any
 
-import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from service.values import (
@@ -57,6 +55,7 @@ from visloc.localization.solving import Look, SeenImage, Solved
 from visloc.localization.turning import is_worth_turning
 from visloc.options import LocalizeOptions
 from visloc.priors import Priors
+from visloc.threads import use_threads
 from visloc.timing import summed
 from visloc.types import InstantAnswer, Refusal
 
@@ -74,7 +73,7 @@ class Vision:
     """
 
     def __init__(self, settings: WorkerSettings, abandoned: ctypes.c_bool) -> None:
-        self.use_threads(settings.threads)
+        use_threads(settings.threads)
         self._settings = settings
         self._limits = ImageLimits(settings.max_image_bytes, settings.max_image_pixels)
         self._abandoned = abandoned
@@ -83,15 +82,6 @@ class Vision:
     @property
     def open_maps(self) -> tuple[OpenMap, ...]:
         return self._maps.refs
-
-    def use_threads(self, count: int) -> None:
-        """Compute with so many threads from now on; answers do not depend on it.
-
-        OpenVINO keeps those that its networks were compiled with. That costs nothing: its threads
-        do not spin while they wait.
-        """
-        torch.set_num_threads(count)
-        cv2.setNumThreads(count)
 
     def ping(self) -> int:
         """Return the id of the process, which shows that it is alive."""

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import importlib
 import os
+import sys
 import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
+from types import ModuleType
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+from visloc.matching import compiled
+from visloc.threads import count_of_threads
 
 if TYPE_CHECKING:
     import torch
@@ -117,14 +123,12 @@ def _has_integer_products() -> bool:
 
 
 def in_threads(work: Callable[[S], T], items: Iterable[S]) -> list[T]:
-    """Do the work for each item, with as many threads as torch uses; results in their order.
+    """Do the work for each item, in as many threads as this process uses; results in their order.
 
     Each thread computes its items alone. Threads that share one product wait for each other a
     hundred times per query, which costs ten times the work when other processes take turns.
     """
-    import torch
-
-    threads = torch.get_num_threads()
+    threads = count_of_threads()
     if threads == 1:
         return [work(item) for item in items]
     turns = threading.Semaphore(threads)  # there may be more threads
@@ -142,9 +146,7 @@ def start_threads() -> None:
     To be called before other threads use torch: while these start, a thread that asks torch for the
     first time would be told to compute with one thread, and would do so for ever.
     """
-    import torch
-
-    if (threads := torch.get_num_threads()) > 1:
+    if (threads := count_of_threads()) > 1:
         _single_threads(threads)
 
 
@@ -174,13 +176,13 @@ def _single_threads(count: int) -> ThreadPoolExecutor:
 
 
 def _start_single_threads(count: int) -> ThreadPoolExecutor:
-    import torch
-
+    torch = _torch_of_products()
     started = threading.Barrier(count + 1)
 
     def compute_alone() -> None:
-        torch.get_num_threads()  # a thread's first question would undo what was set before it
-        torch.set_num_threads(1)
+        if torch is not None:
+            torch.get_num_threads()  # a thread's first question would undo what was set before it
+            torch.set_num_threads(1)
         started.wait()
 
     pool = ThreadPoolExecutor(count, "matching", compute_alone)
@@ -192,6 +194,14 @@ def _start_single_threads(count: int) -> ThreadPoolExecutor:
         started.abort()
         raise
     finally:
-        # A count that one thread sets for itself is also the count of threads started later.
-        torch.set_num_threads(count)
+        if torch is not None:
+            # A count that one thread sets for itself is also the count of threads started later.
+            torch.set_num_threads(count)
     return pool
+
+
+def _torch_of_products() -> ModuleType | None:
+    """Return torch if it computes products here, or if anything has loaded it."""
+    if compiled.level() == 0:
+        return importlib.import_module("torch")
+    return sys.modules.get("torch")

@@ -7,10 +7,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-import cv2
 import numpy as np
 import pytest
-import torch
 
 from service.values import (
     Abandoned,
@@ -53,18 +51,6 @@ def test_global_descriptors_are_made_once_for_all_maps_with_the_settings(
         maps.localizer(MapFolder(ref, folder))
     settings = (WEIGHTS, Inference.FP32, 1)
     assert made == [("densevlad", *settings), ("localvlad", *settings)]
-
-
-def test_a_task_computes_with_the_threads_that_it_was_given() -> None:
-    before = torch.get_num_threads()
-    try:
-        one = Vision(SETTINGS, ctypes.c_bool(False))
-        assert torch.get_num_threads() == SETTINGS.threads
-        one.use_threads(2)
-        assert (torch.get_num_threads(), cv2.getNumThreads()) == (2, 2)
-    finally:
-        torch.set_num_threads(before)
-        cv2.setNumThreads(before)
 
 
 def test_a_map_whose_descriptor_has_no_weights_here_is_a_conflict(

@@ -6,9 +6,10 @@ import logging
 from functools import cache
 from pathlib import Path
 
-from visloc.device import has_cuda
+from visloc.device import has_cuda, may_have_cuda
 from visloc.errors import refuse
 from visloc.features.backends.openvino import import_openvino
+from visloc.matching import compiled
 from visloc.options import Inference
 
 _LOGGER = logging.getLogger(__name__)
@@ -51,6 +52,14 @@ def choose_inference(wanted: Inference) -> Inference:
             got=wanted.value,
         )
     return wanted
+
+
+def is_torch_sure() -> bool:
+    """Return whether this machine computes with torch unless told otherwise; loads OpenVINO.
+
+    It does not ask whether a GPU works, which would make it useless to forked children.
+    """
+    return may_have_cuda() or _missing_openvino() is not None or not compiled.LIBRARY.exists()
 
 
 def _automatic() -> tuple[Inference, str]:

@@ -15,13 +15,12 @@ import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from torch import nn
+from visloc.features.backends.convolution import Convolution
 
 _CONVERTER = "openvino.tools.ovc"
 _IMPORT_LOCK = threading.Lock()
@@ -91,9 +90,8 @@ class GraphBuilder:
         self,
         x: Any,
         name: str,
-        convolution: nn.Conv2d,
+        convolution: Convolution,
         *,
-        padding: tuple[int, int] | None = None,
         relu: bool = False,
     ) -> Any:
         """Convolve x (1, I, h, w); in groups, always in floats.
@@ -101,30 +99,23 @@ class GraphBuilder:
         Args:
             x: what enters.
             name: of the convolution, among those of ``inputs`` and ranges.
-            convolution: with weights and a bias, on the processor.
-            padding: pixels before and after in both directions, if not the convolution's own.
+            convolution: with its numbers.
             relu: whether negative values become zero.
         """
         self.inputs[name] = x
-        assert convolution.bias is not None
-        weight, bias = (
-            np.ascontiguousarray(each.detach().numpy())
-            for each in (convolution.weight, convolution.bias)
-        )
+        weight, bias = convolution.weight, convolution.bias
         kernel = self.constant(weight)
         if name in self._ranges:
             x = self.quantized(x, name)
             largest = np.abs(weight).max(axis=(1, 2, 3), keepdims=True)
             largest = np.maximum(largest, np.finfo(np.float32).tiny)
             kernel = self._in_levels(kernel, -largest, largest, _WEIGHT_LEVELS)
-        own = convolution.padding[0]
-        assert isinstance(own, int)
-        before, after = padding or (own, own)
+        before, after = convolution.padding
         convolve = self._operations.convolution
         if convolution.groups > 1:
             convolve = self._operations.group_convolution
             kernel = self.constant(weight.reshape(convolution.groups, -1, *weight.shape[1:]))
-        strides, dilations = list(convolution.stride), list(convolution.dilation)
+        strides, dilations = [convolution.stride] * 2, [convolution.dilation] * 2
         x = convolve(x, kernel, strides, [before] * 2, [after] * 2, dilations)
         x = self._operations.add(x, self.constant(bias[None, :, None, None]))
         return self._operations.relu(x) if relu else x

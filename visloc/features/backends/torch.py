@@ -2,45 +2,36 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import torch
-from numpy.typing import NDArray
 from torch import nn
 
+from visloc.features.backends.convolution import Convolution
 from visloc.features.weights.checkpoint import Checkpoint
 from visloc.features.weights.files import check_shapes
 
 N = TypeVar("N", bound=nn.Module)
 
 
-def fixed_convolution(
-    weight: NDArray[Any],
-    bias: NDArray[Any],
-    *,
-    stride: int = 1,
-    dilation: int = 1,
-    padding: int = 0,
-    groups: int = 1,
-) -> nn.Conv2d:
-    """Return a float32 convolution that will not be trained; weight (O, I / groups, k, k)."""
-    outputs, inputs_of_group, kernel, _ = weight.shape
-    convolution = nn.Conv2d(
-        inputs_of_group * groups,
+def torch_convolution(convolution: Convolution) -> nn.Module:
+    """Return a convolution that will not be trained."""
+    outputs, inputs_of_group, kernel, _ = convolution.weight.shape
+    before, after = convolution.padding
+    made = nn.Conv2d(
+        inputs_of_group * convolution.groups,
         outputs,
         kernel,
-        stride=stride,
-        dilation=dilation,
-        padding=padding,
-        groups=groups,
+        stride=convolution.stride,
+        dilation=convolution.dilation,
+        padding=before if before == after else 0,
+        groups=convolution.groups,
     )
     # channels_last is a quarter faster on CPUs when the input has the same layout.
-    fast_weight = torch.tensor(weight, dtype=torch.float32).contiguous(
-        memory_format=torch.channels_last
-    )
-    convolution.weight = nn.Parameter(fast_weight, requires_grad=False)
-    convolution.bias = nn.Parameter(torch.tensor(bias, dtype=torch.float32), requires_grad=False)
-    return convolution
+    weight = torch.tensor(convolution.weight).contiguous(memory_format=torch.channels_last)
+    made.weight = nn.Parameter(weight, requires_grad=False)
+    made.bias = nn.Parameter(torch.tensor(convolution.bias), requires_grad=False)
+    return made if before == after else nn.Sequential(nn.ZeroPad2d((before, after) * 2), made)
 
 
 def shapes_of(network: nn.Module) -> dict[str, tuple[int, ...]]:

@@ -26,7 +26,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from visloc.device import torch_device
-from visloc.features.backends.torch import fixed_convolution
+from visloc.features.backends.convolution import Convolution
+from visloc.features.backends.torch import torch_convolution
 from visloc.features.base import GlobalDescriptor
 from visloc.features.descriptors.network_descriptor import (
     NetworkDescriptor,
@@ -142,8 +143,12 @@ def make_vgg16(checkpoint: Checkpoint) -> nn.Sequential:
             steps.append(nn.MaxPool2d(2))
         for _ in widths:
             name = f"encoder.{len(steps)}"
-            weight, bias = (checkpoint.tensors[f"{name}.{part}"] for part in ("weight", "bias"))
-            steps += [fixed_convolution(weight, bias, padding=1), nn.ReLU(inplace=True)]
+            weight, bias = (
+                checkpoint.tensors[f"{name}.{part}"].astype(np.float32)
+                for part in ("weight", "bias")
+            )
+            convolution = torch_convolution(Convolution(weight, bias, padding=(1, 1)))
+            steps += [convolution, nn.ReLU(inplace=True)]
     return nn.Sequential(*steps[:-1])
 
 

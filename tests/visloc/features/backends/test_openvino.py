@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from visloc.features.backends.convolution import Convolution
 from visloc.features.backends.openvino import Graph, GraphBuilder, import_openvino
-from visloc.features.backends.torch import fixed_convolution
 
 _SIDES = (8, 256, 16)
 
@@ -21,7 +21,7 @@ def doubling() -> Graph:
     """Doubles images of one channel."""
     _, operations = import_openvino()
     x = operations.parameter([1, 1, -1, -1], np.float32, name="x")
-    double = fixed_convolution(np.full((1, 1, 1, 1), 2), np.zeros(1))
+    double = Convolution(np.full((1, 1, 1, 1), 2, np.float32), np.zeros(1, np.float32))
     return Graph([x], [GraphBuilder().convolution(x, "only", double)], 1)
 
 

@@ -15,16 +15,15 @@ from PIL import Image
 from torch import Tensor
 
 from visloc.errors import WeightsError
-from visloc.features.backends.torch import shapes_of
 from visloc.features.descriptors.convvlad import load_convvlad
 from visloc.features.descriptors.gem import load_gem
 from visloc.features.descriptors.pooling import generalized_mean
 from visloc.features.networks.efficientnet import model as efficientnet_lite
 from visloc.features.networks.efficientnet.load import Network
 from visloc.features.networks.efficientnet.model import (
-    EfficientNetLite0,
     blocks_of,
     network_input,
+    tensor_shapes,
 )
 from visloc.features.networks.efficientnet.openvino import OpenVinoNetwork
 from visloc.features.networks.efficientnet.torch import TorchNetwork
@@ -46,8 +45,7 @@ def random_weights() -> Checkpoint:
     """Weights of the published names and shapes that keep activations of the order of one."""
     random = np.random.default_rng(0)
     tensors: dict[str, NDArray[np.float32]] = {}
-    with torch.device("meta"):
-        shapes = shapes_of(EfficientNetLite0())
+    shapes = tensor_shapes()
     for name, shape in shapes.items():
         values = random.normal(0, 1, shape)
         if len(shape) > 1:

@@ -27,6 +27,7 @@ from visloc.features.networks.xfeat.extractor import (
 )
 from visloc.features.networks.xfeat.load import load_xfeat
 from visloc.features.networks.xfeat.model import pack, read_network, read_published
+from visloc.features.networks.xfeat.torch import XFeatModule
 from visloc.features.weights.checkpoint import read_checkpoint
 from visloc.options import Inference
 
@@ -69,7 +70,7 @@ def _reference(state: dict[str, Tensor], grey: Tensor) -> tuple[Tensor, Tensor, 
 
 
 def test_network_equals_the_plain_one_of_the_paper() -> None:
-    network, _ = read_network(None)
+    network = XFeatModule(read_network(None)[0])
     grey = torch.rand((1, 1, 96, 160), generator=torch.Generator().manual_seed(0))
     grey = F.avg_pool2d(grey, 3, stride=1, padding=1)
     state = torch.load(_weights_path(), weights_only=True)
@@ -106,12 +107,19 @@ def test_weights_of_our_own_are_the_network_in_16_bits(tmp_path: Path) -> None:
     published, _ = read_published(None)
     assert sha256 == read_checkpoint(path).sha256
     assert load_xfeat(tmp_path, Inference.FP32).fingerprint.weights_sha256 == sha256
-    state = ours.state_dict()
-    for name, expected in published.state_dict().items():
+    arrays = ours.arrays()
+    for name, expected in published.arrays().items():
         exact = name.endswith(".bias")
-        torch.testing.assert_close(
-            state[name], expected, rtol=0.0 if exact else 1e-3, atol=0.0 if exact else 1e-6
+        np.testing.assert_allclose(
+            arrays[name], expected, rtol=0.0 if exact else 1e-3, atol=0.0 if exact else 1e-6
         )
+
+
+def test_a_module_of_torch_gives_back_the_network_that_it_was_made_of() -> None:
+    published, _ = read_published(None)
+    arrays = XFeatModule(published).network().arrays()
+    for name, expected in published.arrays().items():
+        np.testing.assert_array_equal(arrays[name], expected)
 
 
 def test_published_weights_in_the_folder_come_before_our_own(tmp_path: Path) -> None:

@@ -12,19 +12,17 @@ The weights, trained on ImageNet and converted to PyTorch's names, come with the
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-import torch
-import torch.nn.functional as F
 from numpy.typing import NDArray
 from PIL import Image
-from torch import Tensor, nn
-from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from visloc.features.backends.torch import for_inference, load_strictly
+from visloc.features.backends.convolution import Convolution, batch_norm_shapes, folded
 from visloc.features.weights.checkpoint import Checkpoint, read_checkpoint
-from visloc.features.weights.files import find_weights
+from visloc.features.weights.files import check_shapes, find_weights
 
 FEATURE_CHANNELS = 1280
 MAX_LONG_SIDE_PX = 640
@@ -47,116 +45,76 @@ _STAGES = (
 )
 
 
-class Convolution(nn.Conv2d):
-    """A convolution padded as TensorFlow's "same" pads whole cells.
+class _Layer(NamedTuple):
+    """A convolution without its numbers.
 
     Attributes:
-        sides: pixels of padding before and after, in both directions.
+        name: of its weight.
+        batch_norm: name of the batch norm that follows.
+        shape: of its weight, (O, I / groups, k, k).
+        stride: in both directions.
+        groups: of channels that are convolved on their own.
+        relu6: whether values are cut off at 0 and 6 after it.
     """
 
-    def __init__(
-        self, inputs: int, outputs: int, kernel: int = 1, stride: int = 1, groups: int = 1
-    ) -> None:
-        before, after = (kernel - stride) // 2, (kernel - stride + 1) // 2
-        padding = before if before == after else 0
-        super().__init__(
-            inputs, outputs, kernel, stride, padding=padding, groups=groups, bias=False
-        )
-        self.sides = before, after
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Convolve x (1, I, h, w)."""
-        before, after = self.sides
-        return super().forward(x if before == after else F.pad(x, (before, after) * 2))
+    name: str
+    batch_norm: str
+    shape: tuple[int, int, int, int]
+    stride: int = 1
+    groups: int = 1
+    relu6: bool = True
 
 
-class _MobileBlock(nn.Module):
-    """The tensors of a block under their published names."""
-
-    def __init__(self, inputs: int, outputs: int, kernel: int, stride: int, expansion: int) -> None:
-        super().__init__()
-        wide = inputs * expansion
-        if expansion > 1:
-            self._expand_conv, self._bn0 = Convolution(inputs, wide), _batch_norm(wide)
-        self._depthwise_conv = Convolution(wide, wide, kernel, stride, groups=wide)
-        self._bn1 = _batch_norm(wide)
-        self._project_conv, self._bn2 = Convolution(wide, outputs), _batch_norm(outputs)
-        self.adds_input = stride == 1 and inputs == outputs
-
-    def fused(self) -> Block:
-        """Return the block with the batch norms inside its convolutions."""
-        pairs = [(self._depthwise_conv, self._bn1), (self._project_conv, self._bn2)]
-        if hasattr(self, "_expand_conv"):
-            pairs.insert(0, (self._expand_conv, self._bn0))
-        return Block(
-            [fuse_conv_bn_eval(*pair) for pair in pairs],
-            last_relu6=False,
-            adds_input=self.adds_input,
-        )
-
-
-class EfficientNetLite0(nn.Module):
-    """The tensors of the network under their published names."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._conv_stem = Convolution(3, _STEM_CHANNELS, 3, stride=2)
-        self._bn0 = _batch_norm(_STEM_CHANNELS)
-        blocks, inputs = [], _STEM_CHANNELS
-        for repeats, kernel, first_stride, expansion, outputs in _STAGES:
-            for repeat in range(repeats):
-                stride = first_stride if repeat == 0 else 1
-                blocks.append(_MobileBlock(inputs, outputs, kernel, stride, expansion))
-                inputs = outputs
-        self._blocks = nn.ModuleList(blocks)
-        self._conv_head = Convolution(inputs, FEATURE_CHANNELS)
-        self._bn1 = _batch_norm(FEATURE_CHANNELS)
-        self._fc = nn.Linear(FEATURE_CHANNELS, _CLASSES)  # the classifier, which is not used here
-
-    def fused(self) -> Iterator[Block]:
-        """Yield stem, blocks and head, with the batch norms inside the convolutions."""
-        self.eval()
-        yield Block([fuse_conv_bn_eval(self._conv_stem, self._bn0)], last_relu6=True)
-        for block in self._blocks:
-            assert isinstance(block, _MobileBlock)
-            yield block.fused()
-        yield Block([fuse_conv_bn_eval(self._conv_head, self._bn1)], last_relu6=True)
-
-
-def _batch_norm(channels: int) -> nn.BatchNorm2d:
-    return nn.BatchNorm2d(channels, eps=_BATCH_NORM_EPSILON)
-
-
-class Block(nn.Module):
-    """Convolutions in a row, each followed by ReLU6.
+@dataclass(frozen=True, slots=True, eq=False)
+class Block:
+    """Convolutions in a row, batch norms inside.
 
     Attributes:
-        last_relu6: whether the last one is, too.
+        convolutions: each, and whether ReLU6 follows.
         adds_input: whether what entered is added to what comes out.
     """
 
-    def __init__(
-        self, convolutions: list[Convolution], *, last_relu6: bool, adds_input: bool = False
-    ) -> None:
-        super().__init__()
-        self._convolutions = nn.ModuleList(convolutions)
-        self.last_relu6 = last_relu6
-        self.adds_input = adds_input
+    convolutions: tuple[tuple[Convolution, bool], ...]
+    adds_input: bool = False
 
-    def convolutions(self) -> Iterator[tuple[Convolution, bool]]:
-        """Yield each convolution, and whether ReLU6 follows."""
-        for number, convolution in enumerate(self._convolutions, start=1):
-            assert isinstance(convolution, Convolution)
-            yield convolution, self.last_relu6 or number < len(self._convolutions)
 
-    def forward(self, entered: Tensor) -> Tensor:
-        """Return what comes out of (1, I, h, w)."""
-        x = entered
-        for convolution, relu6 in self.convolutions():
-            x = convolution(x)
-            if relu6:
-                x = F.relu6(x, inplace=True)
-        return entered + x if self.adds_input else x
+def _layers() -> Iterator[tuple[list[_Layer], bool]]:
+    """Yield the layers of stem, blocks and head, and whether their input is added."""
+    yield [_Layer("_conv_stem", "_bn0", (_STEM_CHANNELS, 3, 3, 3), stride=2)], False
+    number, inputs = 0, _STEM_CHANNELS
+    for repeats, kernel, first_stride, expansion, outputs in _STAGES:
+        for repeat in range(repeats):
+            stride = first_stride if repeat == 0 else 1
+            wide, prefix = inputs * expansion, f"_blocks.{number}."
+            layers = [
+                _Layer(
+                    f"{prefix}_depthwise_conv",
+                    f"{prefix}_bn1",
+                    (wide, 1, kernel, kernel),
+                    stride=stride,
+                    groups=wide,
+                ),
+                _Layer(
+                    f"{prefix}_project_conv", f"{prefix}_bn2", (outputs, wide, 1, 1), relu6=False
+                ),
+            ]
+            if expansion > 1:
+                widening = _Layer(f"{prefix}_expand_conv", f"{prefix}_bn0", (wide, inputs, 1, 1))
+                layers.insert(0, widening)
+            yield layers, stride == 1 and inputs == outputs
+            number, inputs = number + 1, outputs
+    yield [_Layer("_conv_head", "_bn1", (FEATURE_CHANNELS, inputs, 1, 1))], False
+
+
+def tensor_shapes() -> dict[str, tuple[int, ...]]:
+    """Return the shape of each tensor of the published file."""
+    shapes: dict[str, tuple[int, ...]] = {}
+    for layers, _ in _layers():
+        for layer in layers:
+            shapes[f"{layer.name}.weight"] = layer.shape
+            shapes |= batch_norm_shapes(layer.batch_norm, layer.shape[0], affine=True)
+    # The classifier, which is not used here.
+    return shapes | {"_fc.weight": (_CLASSES, FEATURE_CHANNELS), "_fc.bias": (_CLASSES,)}
 
 
 def read_efficientnet_lite0(weights_dir: Path | None) -> Checkpoint:
@@ -184,10 +142,28 @@ def blocks_of(checkpoint: Checkpoint) -> tuple[Block, ...]:
     Raises:
         WeightsError: the tensors are of another network.
     """
-    with torch.device("meta"):
-        network = EfficientNetLite0()
-    load_strictly(network, checkpoint, network_name="EfficientNet-Lite0", held="another network")
-    return tuple(for_inference(block) for block in network.fused())
+    check_shapes(checkpoint, tensor_shapes(), network="EfficientNet-Lite0", held="another network")
+    return tuple(
+        Block(tuple(_convolution(checkpoint, layer) for layer in layers), adds_input)
+        for layers, adds_input in _layers()
+    )
+
+
+def _convolution(checkpoint: Checkpoint, layer: _Layer) -> tuple[Convolution, bool]:
+    tensors, (outputs, _, kernel, _) = checkpoint.tensors, layer.shape
+    weight, bias = folded(
+        tensors[f"{layer.name}.weight"],
+        np.zeros(outputs),
+        tensors,
+        layer.batch_norm,
+        _BATCH_NORM_EPSILON,
+    )
+    # As TensorFlow's "same" pads whole cells.
+    padding = (kernel - layer.stride) // 2, (kernel - layer.stride + 1) // 2
+    convolution = Convolution(
+        weight, bias, stride=layer.stride, padding=padding, groups=layer.groups
+    )
+    return convolution, layer.relu6
 
 
 def network_input(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:

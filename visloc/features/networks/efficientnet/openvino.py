@@ -20,10 +20,8 @@ class OpenVinoNetwork:
         image = x = operations.parameter([1, 3, -1, -1], np.float32, name="image")
         for number, block in enumerate(blocks):
             entered = x
-            for step, (convolution, relu6) in enumerate(block.convolutions()):
-                x = builder.convolution(
-                    x, f"{number}.{step}", convolution, padding=convolution.sides
-                )
+            for step, (convolution, relu6) in enumerate(block.convolutions):
+                x = builder.convolution(x, f"{number}.{step}", convolution)
                 if relu6:
                     x = operations.clamp(x, 0.0, 6.0)
             if block.adds_input:

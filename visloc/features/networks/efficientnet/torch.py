@@ -7,11 +7,25 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import nn
+from torch import Tensor, nn
 
 from visloc.device import torch_device
-from visloc.features.backends.torch import computed_with
+from visloc.features.backends.torch import computed_with, torch_convolution
 from visloc.features.networks.efficientnet.model import Block
+
+
+class _BlockModule(nn.Module):
+    def __init__(self, block: Block) -> None:
+        super().__init__()
+        steps: list[nn.Module] = []
+        for convolution, relu6 in block.convolutions:
+            steps += [torch_convolution(convolution), *([nn.ReLU6(inplace=True)] if relu6 else [])]
+        self._steps = nn.Sequential(*steps)
+        self._adds_input = block.adds_input
+
+    def forward(self, entered: Tensor) -> Tensor:
+        x: Tensor = self._steps(entered)
+        return entered + x if self._adds_input else x
 
 
 class TorchNetwork:
@@ -19,7 +33,7 @@ class TorchNetwork:
 
     def __init__(self, blocks: Sequence[Block]) -> None:
         self._device = torch_device()
-        self._network = nn.Sequential(*blocks).to(self._device)
+        self._network = nn.Sequential(*map(_BlockModule, blocks)).to(self._device)
         self.computed_with = computed_with(self._device)
 
     @torch.inference_mode()

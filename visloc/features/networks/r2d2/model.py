@@ -8,24 +8,22 @@ the trunk works at half resolution, and interpolates x back to full resolution b
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
-import torch.nn.functional as F
 from numpy.typing import NDArray
-from torch import Tensor, nn
-from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from visloc.features.backends.torch import for_inference, load_strictly, shapes_of
+from visloc.features.backends.convolution import Convolution, batch_norm_shapes, folded
 from visloc.features.weights.checkpoint import Checkpoint
 from visloc.features.weights.files import (
     FASTER2D2_WASF_N16,
     R2D2_WASF_N16,
     PublishedWeights,
+    Shapes,
+    check_shapes,
     read_own_weights,
     read_weights,
 )
@@ -35,7 +33,6 @@ DESCRIPTOR_DIM = 128
 MEAN = (0.485 * 255, 0.456 * 255, 0.406 * 255)
 STD = (0.229 * 255, 0.224 * 255, 0.225 * 255)
 _BASE_WIDTH, _MAX_BASE_WIDTH = 32, 1024
-_STRIP_ROWS = 32  # rows of x that the heads see at a time: bounds their memory
 
 
 class Layer(NamedTuple):
@@ -72,17 +69,13 @@ class Architecture:
         """Pixels of the image per pixel of x."""
         return 2 if self.pool_after else 1
 
-    def convolutions(self, base_width: int = _BASE_WIDTH) -> Iterator[tuple[Layer, nn.Conv2d]]:
-        """Yield each layer with a new convolution."""
-        inputs = 3
-        for layer in self.layers:
-            outputs = layer.width * base_width or DESCRIPTOR_DIM
-            dilation, padding = layer.dilation, layer.padding
-            yield (
-                layer,
-                nn.Conv2d(inputs, outputs, layer.kernel, dilation=dilation, padding=padding),
-            )
-            inputs = outputs
+    def weight_shapes(self, base_width: int = _BASE_WIDTH) -> list[tuple[int, int, int, int]]:
+        """Return the shape of each layer's weight."""
+        widths = [3] + [layer.width * base_width or DESCRIPTOR_DIM for layer in self.layers]
+        return [
+            (outputs, inputs, layer.kernel, layer.kernel)
+            for layer, inputs, outputs in zip(self.layers, widths, widths[1:], strict=False)
+        ]
 
 
 def _layers(dilations: tuple[int, ...]) -> tuple[Layer, ...]:
@@ -102,106 +95,40 @@ FAST_R2D2 = Architecture(
 )
 
 
-class R2D2Network(nn.Module):
-    """The network with the tensors' published names: ``ops.N``, ``clf`` and ``sal``.
+@dataclass(frozen=True, slots=True, eq=False)
+class R2D2Network:
+    """The network for inference.
 
-    ``fuse`` makes it ready for inference: without batch norms, and with ``heads`` in place of
-    ``clf`` and ``sal``, from x^2 to the logits of reliability and repeatability.
+    Attributes:
+        architecture: without its numbers.
+        convolutions: those of the trunk in order, batch norms inside.
+        heads: from x^2 to the logits of reliability and repeatability; a softmax over two logits
+            needs only their difference.
     """
 
-    def __init__(self, architecture: Architecture, base_width: int = _BASE_WIDTH) -> None:
-        super().__init__()
-        self.architecture = architecture
-        self.stride = architecture.stride
-        steps: list[nn.Module] = []
-        for number, (layer, convolution) in enumerate(architecture.convolutions(base_width), 1):
-            steps.append(convolution)
-            if layer.normalized:
-                steps.append(nn.BatchNorm2d(convolution.out_channels, affine=False))
-            if layer.relu:
-                steps.append(nn.ReLU(inplace=True))
-            if number == architecture.pool_after:
-                steps.append(nn.MaxPool2d(2))
-        self.ops = nn.Sequential(*steps)
-        self.clf = nn.Conv2d(DESCRIPTOR_DIM, 2, 1)
-        self.sal = nn.Conv2d(DESCRIPTOR_DIM, 1, 1)
-        self.heads: nn.Conv2d
+    architecture: Architecture
+    convolutions: tuple[Convolution, ...]
+    heads: Convolution
 
-    def fuse(self) -> R2D2Network:
-        """Put the batch norms into the convolutions, and make ``heads``."""
-        self.eval()
-        for number, step in enumerate(self.ops):
-            if isinstance(step, nn.BatchNorm2d):
-                before = self.ops[number - 1]
-                assert isinstance(before, nn.Conv2d)
-                assert before.bias is not None
-                assert step.running_mean is not None
-                # Subtracted in single precision, so that features stay those of earlier maps.
-                bias = before.bias.float() - step.running_mean.float()
-                before.bias = nn.Parameter(bias.to(before.weight.dtype))
-                step.running_mean.zero_()
-                self.ops[number - 1] = fuse_conv_bn_eval(before, step)
-                self.ops[number] = nn.Identity()  # the others keep their names
-        clf, sal = self.clf.state_dict(), self.sal.state_dict()
-        self.heads = nn.Conv2d(DESCRIPTOR_DIM, 2, 1)
-        # A softmax over two logits needs only their difference.
-        self.heads.load_state_dict(
-            {
-                part: torch.cat([clf[part][1:] - clf[part][:1], sal[part]])
-                for part in ("weight", "bias")
-            },
-            assign=True,
+    @staticmethod
+    def of(
+        architecture: Architecture, pairs: Sequence[tuple[NDArray[Any], NDArray[Any]]]
+    ) -> R2D2Network:
+        """Make it of weight and bias of each layer and, last, of the heads (2, 128)."""
+        *trunk, (head_weight, head_bias) = (
+            (np.ascontiguousarray(weight, np.float32), np.ascontiguousarray(bias, np.float32))
+            for weight, bias in pairs
         )
-        del self.clf, self.sal
-        return self
-
-    def convolutions(self) -> Iterator[nn.Conv2d]:
-        """Yield those of the trunk in order."""
-        return (step for step in self.ops if isinstance(step, nn.Conv2d))
-
-    def forward(self, image: Tensor) -> Tensor:
-        """Return x, (1, 128, H // stride, W // stride), for a normalized image (1, 3, H, W)."""
-        features: Tensor = self.ops(image)
-        return features
-
-    def logits(self, features: Tensor) -> Tensor:
-        """Return (2, H, W) logits of reliability and repeatability, at full resolution."""
-        rows = features.shape[2]
-        strips = []
-        for top in range(0, rows, _STRIP_ROWS):
-            bottom = min(top + _STRIP_ROWS, rows)
-            if self.stride == 1:
-                strip = features[:, :, top:bottom]
-            else:  # one row more on either side makes the strips' seams exact
-                first = max(top - 1, 0)
-                strip = F.interpolate(
-                    features[:, :, first : bottom + 1],
-                    scale_factor=self.stride,
-                    mode="bilinear",
-                    align_corners=False,
+        return R2D2Network(
+            architecture,
+            tuple(
+                Convolution(
+                    weight, bias, dilation=layer.dilation, padding=(layer.padding, layer.padding)
                 )
-                strip = strip[:, :, self.stride * (top - first) : self.stride * (bottom - first)]
-            strips.append(self.heads(strip.square()))
-        return torch.cat(strips, dim=2)[0]
-
-    def descriptors(self, features: Tensor, x: Tensor, y: Tensor) -> Tensor:
-        """Return unit rows (N, 128) for pixels (x, y) of the full-resolution maps."""
-        grid = features[0].permute(1, 2, 0)
-        if self.stride == 1:
-            return F.normalize(grid[y, x], dim=1)
-        left, right, x_weight = _neighbours(x, self.stride, grid.shape[1])
-        above, below, y_weight = _neighbours(y, self.stride, grid.shape[0])
-        upper = torch.lerp(grid[above, left], grid[above, right], x_weight)
-        lower = torch.lerp(grid[below, left], grid[below, right], x_weight)
-        return F.normalize(torch.lerp(upper, lower, y_weight), dim=1)
-
-
-def _neighbours(index: Tensor, stride: int, size: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return both neighbours at low resolution and the second one's weight, (N,), (N,), (N, 1)."""
-    position = ((index + 0.5) / stride - 0.5).clamp(0, size - 1)
-    lower = position.floor()
-    upper = (lower + 1).clamp(max=size - 1)
-    return lower.long(), upper.long(), (position - lower)[:, None]
+                for layer, (weight, bias) in zip(architecture.layers, trunk, strict=True)
+            ),
+            Convolution(head_weight[:, :, None, None], head_bias),
+        )
 
 
 def read_network(architecture: Architecture, weights_dir: Path | None) -> tuple[R2D2Network, str]:
@@ -223,16 +150,52 @@ def _from_published(architecture: Architecture, checkpoint: Checkpoint) -> R2D2N
     # Training on several GPUs puts "module." before every name.
     checkpoint = checkpoint.renamed(lambda name: name.removeprefix("module."))
     base_width = _base_width(checkpoint, "ops.0.weight")
-    with torch.device("meta"):
-        networks = {each: R2D2Network(each, base_width) for each in (R2D2, FAST_R2D2)}
+    shapes = {each: _published_shapes(each, base_width) for each in (R2D2, FAST_R2D2)}
     found = {name: array.shape for name, array in checkpoint.tensors.items()}
     held = next(
-        (each.published.network for each in networks if shapes_of(networks[each]) == found),
-        "another network",
+        (each.published.network for each in shapes if shapes[each] == found), "another network"
     )
-    network = networks[architecture]
-    load_strictly(network, checkpoint, network_name=architecture.published.network, held=held)
-    return for_inference(network.fuse())
+    network = architecture.published.network
+    check_shapes(checkpoint, shapes[architecture], network=network, held=held)
+    tensors, pairs = checkpoint.tensors, []
+    for layer, convolution, batch_norm in _published_names(architecture):
+        weight, bias = (tensors[f"{convolution}.{part}"] for part in ("weight", "bias"))
+        if layer.normalized:
+            # Subtracted in single precision, so that features stay those of earlier maps.
+            bias = bias.astype(np.float32) - tensors[f"{batch_norm}.running_mean"].astype(
+                np.float32
+            )
+            centred = {**tensors, f"{batch_norm}.running_mean": np.zeros(len(bias))}
+            weight, bias = folded(weight, bias, centred, batch_norm)
+        pairs.append((weight, bias))
+    clf, sal = (
+        [tensors[f"{head}.{part}"].astype(np.float64) for part in ("weight", "bias")]
+        for head in ("clf", "sal")
+    )
+    weight, bias = (np.concatenate([c[1:] - c[:1], s]) for c, s in zip(clf, sal, strict=True))
+    return R2D2Network.of(architecture, [*pairs, (weight[:, :, 0, 0], bias)])
+
+
+def _published_names(architecture: Architecture) -> Iterator[tuple[Layer, str, str]]:
+    """Yield each layer with the names of its convolution and of the batch norm that may follow."""
+    step = 0
+    for number, layer in enumerate(architecture.layers, start=1):
+        yield layer, f"ops.{step}", f"ops.{step + 1}"
+        step += 1 + layer.normalized + layer.relu + (number == architecture.pool_after)
+
+
+def _published_shapes(architecture: Architecture, base_width: int) -> Shapes:
+    shapes: dict[str, tuple[int, ...]] = {}
+    weights = architecture.weight_shapes(base_width)
+    names = _published_names(architecture)
+    for (layer, convolution, batch_norm), weight in zip(names, weights, strict=True):
+        shapes |= {f"{convolution}.weight": weight, f"{convolution}.bias": weight[:1]}
+        if layer.normalized:
+            shapes |= batch_norm_shapes(batch_norm, weight[0])
+    for head, outputs in (("clf", 2), ("sal", 1)):
+        shapes[f"{head}.weight"] = (outputs, DESCRIPTOR_DIM, 1, 1)
+        shapes[f"{head}.bias"] = (outputs,)
+    return shapes
 
 
 def _base_width(checkpoint: Checkpoint, name: str) -> int:
@@ -247,15 +210,13 @@ def pack(network: R2D2Network) -> dict[str, NDArray[Any]]:
 
     ``NAME.convolutions.N.weight`` and ``.bias`` count from 0; ``NAME.heads.weight`` is (2, 128).
     """
-    names = {theirs: ours for ours, theirs in _own_names(network).items()}
-    tensors = {names[name]: tensor.numpy() for name, tensor in network.state_dict().items()}
-    heads = f"{network.architecture.name}.heads.weight"
-    tensors[heads] = tensors[heads][:, :, 0, 0]
-    # In the usual order of memory, as safetensors writes it whatever the order is.
-    return {
-        name: array.astype(np.float16, order="C") if name.endswith(".weight") else array
-        for name, array in tensors.items()
-    }
+    tensors: dict[str, NDArray[Any]] = {}
+    names = _own_names(network.architecture)
+    for name, convolution in zip(names, (*network.convolutions, network.heads), strict=True):
+        tensors[f"{name}.weight"] = convolution.weight.astype(np.float16)
+        tensors[f"{name}.bias"] = convolution.bias
+    tensors[f"{names[-1]}.weight"] = tensors[f"{names[-1]}.weight"][:, :, 0, 0]
+    return tensors
 
 
 def unpack(architecture: Architecture, checkpoint: Checkpoint) -> R2D2Network:
@@ -264,29 +225,22 @@ def unpack(architecture: Architecture, checkpoint: Checkpoint) -> R2D2Network:
     Raises:
         WeightsError: ``weights.network`` or ``weights.values``.
     """
-    with torch.device("meta"):
-        base_width = _base_width(checkpoint, f"{architecture.name}.convolutions.0.weight")
-        network = R2D2Network(architecture, base_width).fuse()
-    names = _own_names(network)
-    renamed = checkpoint.renamed(lambda name: names.get(name, name))
-    tensors = dict(renamed.tensors)
-    if tensors.get("heads.weight", np.empty(())).ndim == 2:
-        tensors["heads.weight"] = tensors["heads.weight"][:, :, None, None]
-    load_strictly(
-        network,
-        replace(renamed, tensors=tensors),
-        network_name=architecture.published.network,
-        held="another network",
-    )
-    return for_inference(network)
+    names = _own_names(architecture)
+    weights: list[tuple[int, ...]] = [
+        *architecture.weight_shapes(_base_width(checkpoint, f"{names[0]}.weight")),
+        (2, DESCRIPTOR_DIM),
+    ]
+    shapes: dict[str, tuple[int, ...]] = {}
+    for name, weight in zip(names, weights, strict=True):
+        shapes |= {f"{name}.weight": weight, f"{name}.bias": weight[:1]}
+    network = architecture.published.network
+    check_shapes(checkpoint, shapes, network=network, held="another network")
+    tensors = checkpoint.tensors
+    pairs = [(tensors[f"{name}.weight"], tensors[f"{name}.bias"]) for name in names]
+    return R2D2Network.of(architecture, pairs)
 
 
-def _own_names(network: R2D2Network) -> Mapping[str, str]:
-    """Return the name in the network of each tensor in a file of our own."""
-    positions = [n for n, step in enumerate(network.ops) if isinstance(step, nn.Conv2d)]
-    places = {f"convolutions.{number}": f"ops.{n}" for number, n in enumerate(positions)}
-    return {
-        f"{network.architecture.name}.{ours}.{part}": f"{theirs}.{part}"
-        for ours, theirs in {**places, "heads": "heads"}.items()
-        for part in ("weight", "bias")
-    }
+def _own_names(architecture: Architecture) -> list[str]:
+    """Return the names of the trunk's convolutions and, last, of the heads."""
+    trunk = [f"convolutions.{number}" for number, _ in enumerate(architecture.layers)]
+    return [f"{architecture.name}.{name}" for name in (*trunk, "heads")]

@@ -42,7 +42,7 @@ def measure_ranges(network: R2D2Network, threads: int | None = None) -> Ranges:
 
 
 def _names(network: R2D2Network) -> list[str]:
-    return [f"convolutions.{number}" for number, _ in enumerate(network.convolutions())]
+    return [f"convolutions.{number}" for number, _ in enumerate(network.convolutions)]
 
 
 class OpenVinoNetwork:
@@ -51,10 +51,8 @@ class OpenVinoNetwork:
     def __init__(self, network: R2D2Network, ranges: Ranges | None, threads: int | None) -> None:
         image, _, features = _trunk(network, ranges)
         self._graph = Graph([image], [features], threads)
-        self._stride = network.stride
-        weight, bias = network.heads.weight[:, :, 0, 0].numpy(), network.heads.bias
-        assert bias is not None
-        self._heads = np.ascontiguousarray(weight), bias.numpy()
+        self._stride = network.architecture.stride
+        self._heads = network.heads.weight[:, :, 0, 0], network.heads.bias
         self.computed_with = openvino_with(ranges)
 
     @contextmanager
@@ -88,7 +86,7 @@ def _trunk(network: R2D2Network, ranges: Ranges | None) -> tuple[Any, GraphBuild
     x = operations.subtract(x, builder.constant(mean))
     x = operations.multiply(x, builder.constant(1 / deviation))
     architecture, names = network.architecture, _names(network)
-    for number, convolution in enumerate(network.convolutions()):
+    for number, convolution in enumerate(network.convolutions):
         relu = architecture.layers[number].relu
         x = builder.convolution(x, names[number], convolution, relu=relu)
         if number + 1 == architecture.pool_after:

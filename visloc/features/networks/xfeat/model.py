@@ -10,20 +10,17 @@ which only the file is read: importing it would bring in much that is not needed
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-import torch
-import torch.nn.functional as F
 from numpy.typing import NDArray
-from torch import Tensor, nn
-from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from visloc.features.backends.torch import for_inference, load_strictly
+from visloc.features.backends.convolution import Convolution, batch_norm_shapes, folded
 from visloc.features.weights.checkpoint import Checkpoint, read_checkpoint
-from visloc.features.weights.files import find_weights, read_own_weights
+from visloc.features.weights.files import Shapes, check_shapes, find_weights, read_own_weights
 
 CELL_PX = 8  # one cell of the feature map
 _PUBLISHED_FILE = "xfeat.pt"
@@ -31,79 +28,113 @@ _OWN_PREFIX = "xfeat."
 _UNUSED_PREFIX = "fine_matcher."  # refines semi-dense matches, which are not made here
 
 
-class _Layer(nn.Module):
-    """A convolution without bias, its batch norm, and a ReLU."""
+class Layer(NamedTuple):
+    """A convolution without its numbers; padding keeps the size.
 
-    def __init__(self, inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> None:
-        super().__init__()
-        self.layer = nn.Sequential(
-            nn.Conv2d(inputs, outputs, kernel, stride, padding=kernel // 2, bias=False),
-            nn.BatchNorm2d(outputs, affine=False),
-            nn.ReLU(inplace=True),
-        )
+    Attributes:
+        block: the part of the network that it belongs to.
+        number: within the block.
+        inputs: channels.
+        outputs: channels.
+        kernel: width.
+        stride: in both directions.
+        normalized: whether a batch norm and a ReLU follow.
+    """
 
-    def fuse(self) -> None:
-        """Put the batch norm into the convolution."""
-        convolution, batch_norm, _ = self.layer
-        assert isinstance(convolution, nn.Conv2d)
-        assert isinstance(batch_norm, nn.BatchNorm2d)
-        self.layer[0] = fuse_conv_bn_eval(convolution, batch_norm)
-        self.layer[1] = nn.Identity()
+    block: str
+    number: int
+    inputs: int
+    outputs: int
+    kernel: int = 3
+    stride: int = 1
+    normalized: bool = True
 
-    def forward(self, x: Tensor) -> Tensor:
-        y: Tensor = self.layer(x)
-        return y
+    @property
+    def name(self) -> str:
+        """In the network, as published."""
+        return f"{self.block}.{self.number}" + (".layer" if self.normalized else "")
 
+    @property
+    def convolution(self) -> str:
+        """What the names of its weight and bias begin with, as published."""
+        return f"{self.name}.0" if self.normalized else self.name
 
-class XFeatNetwork(nn.Module):
-    """The network with the tensors' published names."""
+    @property
+    def batch_norm(self) -> str:
+        """What the names of its batch norm begin with, as published."""
+        return f"{self.name}.1"
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.skip1 = nn.Sequential(nn.AvgPool2d(4), nn.Conv2d(1, 24, 1))
-        self.block1 = nn.Sequential(
-            _Layer(1, 4), _Layer(4, 8, stride=2), _Layer(8, 8), _Layer(8, 24, stride=2)
-        )
-        self.block2 = nn.Sequential(_Layer(24, 24), _Layer(24, 24))
-        self.block3 = nn.Sequential(_Layer(24, 64, stride=2), _Layer(64, 64), _Layer(64, 64, 1))
-        self.block4 = nn.Sequential(_Layer(64, 64, stride=2), _Layer(64, 64), _Layer(64, 64))
-        self.block5 = nn.Sequential(
-            _Layer(64, 128, stride=2), _Layer(128, 128), _Layer(128, 128), _Layer(128, 64, 1)
-        )
-        self.block_fusion = nn.Sequential(_Layer(64, 64), _Layer(64, 64), nn.Conv2d(64, 64, 1))
-        self.heatmap_head = nn.Sequential(_Layer(64, 64, 1), _Layer(64, 64, 1), nn.Conv2d(64, 1, 1))
-        self.keypoint_head = nn.Sequential(
-            _Layer(64, 64, 1), _Layer(64, 64, 1), _Layer(64, 64, 1), nn.Conv2d(64, 65, 1)
-        )
-
-    def fuse(self) -> XFeatNetwork:
-        """Put the batch norms into the convolutions."""
-        self.eval()
-        for module in self.modules():
-            if isinstance(module, _Layer):
-                module.fuse()
-        return self
-
-    def forward(self, grey: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Look at a grey image (1, 1, H, W) in 0..1 whose sides are multiples of 32.
-
-        Returns, for cells of 8 x 8 pixels: features (1, 64, H/8, W/8), keypoint logits
-        (1, 65, H/8, W/8) and reliability (1, 1, H/8, W/8) in 0..1.
-        """
-        image = F.instance_norm(grey)
-        eighth = self.block3(self.block2(self.block1(image) + self.skip1(image)))
-        sixteenth = self.block4(eighth)
-        thirty_second = self.block5(sixteenth)
-        size = eighth.shape[2:]
-        features = self.block_fusion(
-            eighth + _resized(sixteenth, size) + _resized(thirty_second, size)
-        )
-        reliability = torch.sigmoid(self.heatmap_head(features))
-        return features, self.keypoint_head(F.pixel_unshuffle(image, CELL_PX)), reliability
+    @property
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Of weight and bias, by their names."""
+        return {
+            f"{self.convolution}.weight": (self.outputs, self.inputs, self.kernel, self.kernel),
+            f"{self.convolution}.bias": (self.outputs,),
+        }
 
 
-def _resized(image: Tensor, size: tuple[int, ...]) -> Tensor:
-    return F.interpolate(image, size, mode="bilinear", align_corners=False)
+LAYERS = (
+    Layer("skip1", 1, 1, 24, kernel=1, normalized=False),
+    Layer("block1", 0, 1, 4),
+    Layer("block1", 1, 4, 8, stride=2),
+    Layer("block1", 2, 8, 8),
+    Layer("block1", 3, 8, 24, stride=2),
+    Layer("block2", 0, 24, 24),
+    Layer("block2", 1, 24, 24),
+    Layer("block3", 0, 24, 64, stride=2),
+    Layer("block3", 1, 64, 64),
+    Layer("block3", 2, 64, 64, kernel=1),
+    Layer("block4", 0, 64, 64, stride=2),
+    Layer("block4", 1, 64, 64),
+    Layer("block4", 2, 64, 64),
+    Layer("block5", 0, 64, 128, stride=2),
+    Layer("block5", 1, 128, 128),
+    Layer("block5", 2, 128, 128),
+    Layer("block5", 3, 128, 64, kernel=1),
+    Layer("block_fusion", 0, 64, 64),
+    Layer("block_fusion", 1, 64, 64),
+    Layer("block_fusion", 2, 64, 64, kernel=1, normalized=False),
+    Layer("heatmap_head", 0, 64, 64, kernel=1),
+    Layer("heatmap_head", 1, 64, 64, kernel=1),
+    Layer("heatmap_head", 2, 64, 1, kernel=1, normalized=False),
+    Layer("keypoint_head", 0, 64, 64, kernel=1),
+    Layer("keypoint_head", 1, 64, 64, kernel=1),
+    Layer("keypoint_head", 2, 64, 64, kernel=1),
+    Layer("keypoint_head", 3, 64, 65, kernel=1, normalized=False),
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class XFeatNetwork:
+    """The network for inference, batch norms inside the convolutions.
+
+    Attributes:
+        convolutions: those of ``LAYERS``.
+    """
+
+    convolutions: tuple[Convolution, ...]
+
+    @staticmethod
+    def of(arrays: Mapping[str, NDArray[Any]]) -> XFeatNetwork:
+        """Make it of weights and biases under their published names."""
+        convolutions = []
+        for layer in LAYERS:
+            weight, bias = (np.ascontiguousarray(arrays[name], np.float32) for name in layer.shapes)
+            padding = layer.kernel // 2, layer.kernel // 2
+            convolutions.append(Convolution(weight, bias, stride=layer.stride, padding=padding))
+        return XFeatNetwork(tuple(convolutions))
+
+    def arrays(self) -> dict[str, NDArray[np.float32]]:
+        """Return weights and biases under their published names."""
+        found: dict[str, NDArray[np.float32]] = {}
+        for layer, convolution in zip(LAYERS, self.convolutions, strict=True):
+            found |= zip(layer.shapes, (convolution.weight, convolution.bias), strict=True)
+        return found
+
+    def block(self, name: str) -> Iterator[tuple[Layer, Convolution]]:
+        """Yield the layers of a block, with their convolutions, in order."""
+        pairs = zip(LAYERS, self.convolutions, strict=True)
+        return (pair for pair in pairs if pair[0].block == name)
 
 
 def read_network(weights_dir: Path | None) -> tuple[XFeatNetwork, str]:
@@ -143,25 +174,27 @@ def read_published(weights_dir: Path | None) -> tuple[XFeatNetwork, str]:
         for name, array in checkpoint.tensors.items()
         if not name.startswith(_UNUSED_PREFIX)
     }
-    with torch.device("meta"):
-        network = XFeatNetwork()
-    load_strictly(
-        network, replace(checkpoint, tensors=used), network_name="XFeat", held="another network"
-    )
-    return for_inference(network.fuse()), checkpoint.sha256
+    expected: dict[str, tuple[int, ...]] = {}
+    for layer in LAYERS:
+        expected |= layer.shapes
+        if layer.normalized:
+            del expected[f"{layer.convolution}.bias"]
+            expected |= batch_norm_shapes(layer.batch_norm, layer.outputs)
+    _check(replace(checkpoint, tensors=used), expected)
+    arrays = dict(used)
+    for layer in LAYERS:
+        if layer.normalized:
+            weight = used[f"{layer.convolution}.weight"]
+            both = folded(weight, np.zeros(layer.outputs), used, layer.batch_norm)
+            arrays |= zip(layer.shapes, both, strict=True)
+    return XFeatNetwork.of(arrays), checkpoint.sha256
 
 
 def pack(network: XFeatNetwork) -> dict[str, NDArray[Any]]:
-    """Return the tensors of a file of our own: weights in 16 bits, biases in 32.
-
-    Their names are those of the network with its batch norms inside the convolutions.
-    """
-    arrays = {name: tensor.numpy() for name, tensor in network.state_dict().items()}
+    """Return the tensors of a file of our own: weights in 16 bits, biases in 32."""
     return {
-        _OWN_PREFIX + name: array.astype(np.float16, order="C")
-        if name.endswith(".weight")
-        else array
-        for name, array in arrays.items()
+        _OWN_PREFIX + name: array.astype(np.float16) if name.endswith(".weight") else array
+        for name, array in network.arrays().items()
     }
 
 
@@ -171,8 +204,10 @@ def unpack(checkpoint: Checkpoint) -> XFeatNetwork:
     Raises:
         WeightsError: ``weights.network`` or ``weights.values``.
     """
-    with torch.device("meta"):
-        network = XFeatNetwork().fuse()
-    renamed = checkpoint.renamed(lambda name: name.removeprefix(_OWN_PREFIX))
-    load_strictly(network, renamed, network_name="XFeat", held="another network")
-    return for_inference(network)
+    checkpoint = checkpoint.renamed(lambda name: name.removeprefix(_OWN_PREFIX))
+    _check(checkpoint, {name: shape for layer in LAYERS for name, shape in layer.shapes.items()})
+    return XFeatNetwork.of(checkpoint.tensors)
+
+
+def _check(checkpoint: Checkpoint, expected: Shapes) -> None:
+    check_shapes(checkpoint, expected, network="XFeat", held="another network")

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import nn
 
 from visloc.features.backends.calibration import measure, ranges_of
 from visloc.features.backends.openvino import (
@@ -18,7 +16,7 @@ from visloc.features.backends.openvino import (
     openvino_with,
 )
 from visloc.features.networks.xfeat.extractor import Seen, network_input
-from visloc.features.networks.xfeat.model import CELL_PX, XFeatNetwork
+from visloc.features.networks.xfeat.model import CELL_PX, LAYERS, XFeatNetwork
 
 _VARIANCE_EPSILON = 1e-5
 
@@ -35,28 +33,21 @@ def make_openvino_network(
     if not in_8_bits:
         return OpenVinoNetwork(network, None, threads)
     ranges = ranges_of(
-        "xfeat", weights_sha256, _quantized(network), lambda: measure_ranges(network, threads)
+        "xfeat", weights_sha256, _quantized(), lambda: measure_ranges(network, threads)
     )
     return OpenVinoNetwork(network, ranges, threads)
 
 
 def measure_ranges(network: XFeatNetwork, threads: int | None = None) -> Ranges:
     """Measure the ranges that ``OpenVinoNetwork`` takes."""
-    names = _quantized(network)
+    names = _quantized()
     grey, builder, _ = _network(network, None)
     graph = Graph([grey], builder.extremes(names), threads)
     return measure(names, graph, lambda rgb: _input(network_input(rgb)))
 
 
-def _quantized(network: XFeatNetwork) -> list[str]:
-    return [name for block in _QUANTIZED_BLOCKS for name, _, _ in _convolutions(network, block)]
-
-
-def _convolutions(network: XFeatNetwork, block: str) -> Iterator[tuple[str, nn.Conv2d, bool]]:
-    """Yield name and convolution of each layer of a block, and whether a ReLU follows."""
-    for name, module in network.get_submodule(block).named_modules(prefix=block):
-        if isinstance(module, nn.Conv2d):
-            yield name.replace(".layer.0", ".layer"), module, ".layer." in name
+def _quantized() -> list[str]:
+    return [layer.name for layer in LAYERS if layer.block in _QUANTIZED_BLOCKS]
 
 
 class OpenVinoNetwork:
@@ -83,8 +74,8 @@ def _network(network: XFeatNetwork, ranges: Ranges | None) -> tuple[Any, GraphBu
     builder = GraphBuilder(ranges)
 
     def block(name: str, x: Any) -> Any:
-        for convolution_name, convolution, relu in _convolutions(network, name):
-            x = builder.convolution(x, convolution_name, convolution, relu=relu)
+        for layer, convolution in network.block(name):
+            x = builder.convolution(x, layer.name, convolution, relu=layer.normalized)
         return x
 
     def enlarged(x: Any, times: float) -> Any:

@@ -1,0 +1,52 @@
+"""How many threads this process computes with."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import cv2
+
+_VARIABLE = "OMP_NUM_THREADS"  # torch and others read it when they are loaded
+
+
+def use_threads(count: int) -> None:
+    """Compute with so many threads from now on; answers do not depend on it.
+
+    OpenVINO keeps those that its networks were compiled with. That costs nothing: its threads do
+    not spin while they wait.
+    """
+    cv2.setNumThreads(count)
+    os.environ[_VARIABLE] = str(count)
+    torch = sys.modules.get("torch")
+    if torch is not None:  # else it reads the variable when something needs it
+        torch.set_num_threads(count)
+
+
+def count_of_threads() -> int:
+    """Return how many: those of torch if it is loaded, else those that it would have."""
+    torch = sys.modules.get("torch")
+    if torch is not None:
+        return int(torch.get_num_threads())
+    asked = os.environ.get(_VARIABLE, "").partition(",")[0]
+    if asked.isdecimal() and int(asked) > 0:
+        return int(asked)
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextmanager
+def threads(count: int) -> Iterator[None]:
+    """Compute with so many threads within the ``with`` block."""
+    before, of_opencv, variable = count_of_threads(), cv2.getNumThreads(), os.environ.get(_VARIABLE)
+    use_threads(count)
+    try:
+        yield
+    finally:
+        use_threads(before)
+        cv2.setNumThreads(of_opencv)
+        if variable is None:
+            del os.environ[_VARIABLE]
+        else:
+            os.environ[_VARIABLE] = variable
