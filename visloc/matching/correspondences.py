@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.device import torch_device
+from visloc.device import has_cuda, torch_device
 from visloc.matching.nearest import Nearest, nearest
 from visloc.matching.on_device import nearest_on
 from visloc.matching.products import EightBitRows, in_threads
@@ -191,13 +191,12 @@ def propose_landmarks(
     if not photos:
         return Proposals.none()
     descriptors = [rows for _, rows in photos]
-    device = torch_device()
-    if device.type == "cpu":
+    if has_cuda():
+        pairs = mutual_nearest_neighbours_on(torch_device(), query, descriptors, max_ratio)
+    else:
         pairs = in_threads(
             partial(mutual_nearest_neighbours, query, max_ratio=max_ratio), descriptors
         )
-    else:
-        pairs = mutual_nearest_neighbours_on(device, query, descriptors, max_ratio)
     found = [
         (i, landmarks[j].astype(np.int64), similarity)
         for (landmarks, _), (i, j, similarity) in zip(photos, pairs, strict=True)
