@@ -35,7 +35,7 @@ TOP_K = 20
 
 def main(folder: Path, queries: int = 100) -> None:
     """Open the map, ask it ``queries`` times, print."""
-    start_threads()  # loads torch, once in a process whatever it opens
+    start_threads()  # once in a process, whatever it opens
     started, before = time.perf_counter(), anonymous_mb()
     opened = open_map(folder)
     localizer = Localizer(opened, None)

@@ -7,9 +7,10 @@ import importlib
 import signal
 
 import service.workers.vision  # noqa: F401  loaded once, for all of them
-from visloc.features.backends.choice import is_torch_sure
+from visloc.features.backends.choice import may_be_torch
+from visloc.matching import compiled
 
-if is_torch_sure():
+if may_be_torch() or not compiled.LIBRARY.exists():
     importlib.import_module("torch")
 
 # A signal to the group of processes is for the main process, which lets requests end.

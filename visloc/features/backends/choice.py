@@ -9,7 +9,6 @@ from pathlib import Path
 from visloc.device import has_cuda, may_have_cuda
 from visloc.errors import refuse
 from visloc.features.backends.openvino import import_openvino
-from visloc.matching import compiled
 from visloc.options import Inference
 
 _LOGGER = logging.getLogger(__name__)
@@ -54,12 +53,9 @@ def choose_inference(wanted: Inference) -> Inference:
     return wanted
 
 
-def is_torch_sure() -> bool:
-    """Return whether this machine computes with torch unless told otherwise; loads OpenVINO.
-
-    It does not ask whether a GPU works, which would make it useless to forked children.
-    """
-    return may_have_cuda() or _missing_openvino() is not None or not compiled.LIBRARY.exists()
+def may_be_torch() -> bool:
+    """Return whether AUTO may be TORCH here. Loads OpenVINO, and nothing of a GPU."""
+    return may_have_cuda() or _missing_openvino() is not None
 
 
 def _automatic() -> tuple[Inference, str]:
