@@ -73,7 +73,7 @@ def first_photos(root: Path, count: int, output: Path) -> Path:
 
 def built(command: Path, dataset: Path, way: str, maps_dir: Path, workers: int) -> Built:
     """Build a map, and remove it."""
-    call = [str(command.absolute()), "build", str(dataset), "--map", "bench", *WAYS[way]]
+    call = [str(command.absolute()), "build", str(dataset.absolute()), "--map", "bench", *WAYS[way]]
     call += ["--maps-dir", str(maps_dir), "--workers", str(workers)]
     _adopt_orphans()
     start = time.perf_counter()
