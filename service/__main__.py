@@ -38,8 +38,8 @@ def main() -> None:
         sys.exit(f"visloc-service: {error}")
     # Libraries read these once when they are loaded: hence the late import below.
     os.environ.setdefault("OMP_NUM_THREADS", str(settings.threads_per_worker))
-    # torch and OpenVINO do the heavy work. OpenBLAS's threads would spin while they wait for each
-    # other, on cores that torch and OpenVINO need.
+    # OpenVINO and compiled matching do the heavy work. OpenBLAS's threads would spin while they wait
+    # for each other, on cores that these need.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(settings.max_image_pixels))
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # damaged photos get an answer, no log line

@@ -16,7 +16,7 @@ from training.settings import Settings
 from visloc.errors import NotFound, refuse
 
 FILE_NAME = "checkpoint.pt"
-_VERSION = 1
+_VERSION = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,7 +30,7 @@ class State:
         step: how many are done.
         seconds: how long that took, on all machines together.
         sources: words for the model card: sha256 of the photos, their licences, and so on.
-        network: state dict of ``training.network.TrainableR2D2``.
+        network: state dict of ``training.network.TrainableR2D2``, or of XFeat's ``XFeatModule``.
         optimizer: state dict of Adam.
     """
 

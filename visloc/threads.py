@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import ModuleType
 
 import cv2
 
@@ -13,21 +15,21 @@ _VARIABLE = "OMP_NUM_THREADS"  # torch and others read it when they are loaded
 
 
 def use_threads(count: int) -> None:
-    """Compute with so many threads from now on; answers do not depend on it.
+    """Set the number of threads; answers do not depend on it.
 
     OpenVINO keeps those that its networks were compiled with. That costs nothing: its threads do
     not spin while they wait.
     """
     cv2.setNumThreads(count)
     os.environ[_VARIABLE] = str(count)
-    torch = sys.modules.get("torch")
+    torch = loaded_torch()
     if torch is not None:  # else it reads the variable when something needs it
         torch.set_num_threads(count)
 
 
 def count_of_threads() -> int:
-    """Return how many: those of torch if it is loaded, else those that it would have."""
-    torch = sys.modules.get("torch")
+    """Return torch's number if it is loaded, else ``OMP_NUM_THREADS`` or one for each processor."""
+    torch = loaded_torch()
     if torch is not None:
         return int(torch.get_num_threads())
     asked = os.environ.get(_VARIABLE, "").partition(",")[0]
@@ -36,9 +38,14 @@ def count_of_threads() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def loaded_torch() -> ModuleType | None:
+    """Return torch if anything has loaded it; waits while another thread does."""
+    return importlib.import_module("torch") if "torch" in sys.modules else None
+
+
 @contextmanager
 def threads(count: int) -> Iterator[None]:
-    """Compute with so many threads within the ``with`` block."""
+    """Set the number of threads within the ``with`` block, of one thread of Python at a time."""
     before, of_opencv, variable = count_of_threads(), cv2.getNumThreads(), os.environ.get(_VARIABLE)
     use_threads(count)
     try:
@@ -47,6 +54,6 @@ def threads(count: int) -> Iterator[None]:
         use_threads(before)
         cv2.setNumThreads(of_opencv)
         if variable is None:
-            del os.environ[_VARIABLE]
+            os.environ.pop(_VARIABLE, None)
         else:
             os.environ[_VARIABLE] = variable

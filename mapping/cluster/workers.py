@@ -7,7 +7,6 @@ import multiprocessing.util
 import os
 import shutil
 import signal
-import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -39,7 +38,7 @@ ONE_THREAD = {
     "OPENCV_FOR_THREADS_NUM": "1",
 }
 
-_PRELOADED = "mapping.build.build"  # what the tasks of a build need
+_FORK_SERVER = "mapping.build.forkserver"
 
 # The server's socket lies below the folder of temporary files. Its path has at most 107 bytes, of
 # which multiprocessing appends 32.
@@ -150,8 +149,7 @@ def _start_method() -> multiprocessing.context.BaseContext:
     if len(os.fsencode(tempfile.gettempdir())) > _LONGEST_TEMPORARY:
         return multiprocessing.get_context("spawn")
     context = multiprocessing.get_context("forkserver")
-    # Where this process has loaded torch for its networks, the others need it too.
-    context.set_forkserver_preload([_PRELOADED, *({"torch"} & sys.modules.keys())])
+    context.set_forkserver_preload([_FORK_SERVER])
     return context
 
 

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import gc
-import importlib
 import signal
 
 import service.workers.vision  # noqa: F401  loaded once, for all of them
-from visloc.features.backends.choice import may_be_torch
-from visloc.matching import compiled
+from visloc.preloading import load_torch_if_sure
 
-if may_be_torch() or not compiled.LIBRARY.exists():
-    importlib.import_module("torch")
+load_torch_if_sure()
 
 # A signal to the group of processes is for the main process, which lets requests end.
 signal.signal(signal.SIGTERM, signal.SIG_IGN)

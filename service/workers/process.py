@@ -7,7 +7,6 @@ import os
 import pickle
 import signal
 import threading
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing import parent_process
@@ -63,20 +62,18 @@ def serve(connection: Connection, settings: WorkerSettings, abandoned: ctypes.c_
     threading.Thread(target=_end_with_parent, daemon=True).start()
     if settings.configure_logging is not None:
         settings.configure_logging()
-    # Not in the main process, which has this module too.
-    from service.workers.vision import Vision
-    from visloc.threads import use_threads
+    from service.workers.vision import Vision  # not in the main process, which has this module too
 
     vision = Vision(settings, abandoned)
     with suppress(EOFError, OSError):  # of the connection
         while True:
-            connection.send_bytes(_reply_to(connection.recv_bytes(), vision, use_threads))
+            connection.send_bytes(_reply_to(connection.recv_bytes(), vision))
 
 
-def _reply_to(message: bytes, vision: Vision, use_threads: Callable[[int], None]) -> bytes:
+def _reply_to(message: bytes, vision: Vision) -> bytes:
     try:
         task, threads = pickle.loads(message)
-        use_threads(threads)
+        vision.use_threads(threads)
         reply = Reply(task(vision), vision.open_maps)
         return pickle.dumps(reply, pickle.HIGHEST_PROTOCOL)
     except BaseException as error:  # noqa: BLE001  whatever it is, the main process gets it

@@ -73,7 +73,6 @@ class Vision:
     """
 
     def __init__(self, settings: WorkerSettings, abandoned: ctypes.c_bool) -> None:
-        use_threads(settings.threads)
         self._settings = settings
         self._limits = ImageLimits(settings.max_image_bytes, settings.max_image_pixels)
         self._abandoned = abandoned
@@ -82,6 +81,8 @@ class Vision:
     @property
     def open_maps(self) -> tuple[OpenMap, ...]:
         return self._maps.refs
+
+    use_threads = staticmethod(use_threads)
 
     def ping(self) -> int:
         """Return the id of the process, which shows that it is alive."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import os
-import sys
 import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
@@ -17,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.matching import compiled
-from visloc.threads import count_of_threads
+from visloc.threads import count_of_threads, loaded_torch
 
 if TYPE_CHECKING:
     import torch
@@ -152,7 +151,8 @@ def start_threads() -> None:
 
 # The number of threads changes from one task of the service to the next. So those of the largest
 # number are kept for all: threads for each number would be hundreds on a machine of many cores.
-_pool: tuple[int, ThreadPoolExecutor] | None = None
+# Threads that were started before torch was loaded would each compute with all of torch's.
+_pool: tuple[int, bool, ThreadPoolExecutor] | None = None
 _pool_lock = threading.Lock()
 
 
@@ -169,14 +169,14 @@ if hasattr(os, "register_at_fork"):  # Windows does not fork
 def _single_threads(count: int) -> ThreadPoolExecutor:
     """Return at least so many threads."""
     global _pool
-    with _pool_lock:
-        if _pool is None or _pool[0] < count:
-            _pool = count, _start_single_threads(count)
-        return _pool[1]
-
-
-def _start_single_threads(count: int) -> ThreadPoolExecutor:
     torch = _torch_of_products()
+    with _pool_lock:
+        if _pool is None or _pool[0] < count or (torch is not None and not _pool[1]):
+            _pool = count, torch is not None, _start_single_threads(count, torch)
+        return _pool[2]
+
+
+def _start_single_threads(count: int, torch: ModuleType | None) -> ThreadPoolExecutor:
     started = threading.Barrier(count + 1)
 
     def compute_alone() -> None:
@@ -204,4 +204,4 @@ def _torch_of_products() -> ModuleType | None:
     """Return torch if it computes products here, or if anything has loaded it."""
     if compiled.level() == 0:
         return importlib.import_module("torch")
-    return sys.modules.get("torch")
+    return loaded_torch()

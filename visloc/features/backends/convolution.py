@@ -1,4 +1,4 @@
-"""A convolution of a trained network as arrays, of which every way of computing it is made."""
+"""A trained convolution as arrays, which the backends of torch and OpenVINO share."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def folded(
     batch_norm: str,
     epsilon: float = _EPSILON,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Put a batch norm into the convolution before it, in double precision.
+    """Fold a batch norm into the preceding convolution, in double precision.
 
     Args:
         weight: (O, I / groups, k, k).

@@ -99,7 +99,6 @@ class GraphBuilder:
         Args:
             x: what enters.
             name: of the convolution, among those of ``inputs`` and ranges.
-            convolution: with its numbers.
             relu: whether negative values become zero.
         """
         self.inputs[name] = x

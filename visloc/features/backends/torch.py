@@ -15,7 +15,7 @@ N = TypeVar("N", bound=nn.Module)
 
 
 def torch_convolution(convolution: Convolution) -> nn.Module:
-    """Return a convolution that will not be trained."""
+    """Return a convolution that will not be trained: an ``nn.Conv2d`` if it pads evenly."""
     outputs, inputs_of_group, kernel, _ = convolution.weight.shape
     before, after = convolution.padding
     made = nn.Conv2d(

@@ -4,10 +4,9 @@ Since 1.6 that is a zip archive with the pickle ``<root>/data.pkl`` and the numb
 in ``<root>/data/<key>``; before that, five pickles in a row, then the numbers.
 
 Python's unpickler makes nothing here but the classes and texts of ``_KNOWN``: what the names in the
-file stand for. None of them can be changed by the file. They do not keep it from filling the
-memory, by having a text of a megabyte encoded a hundred thousand times. So the opcodes of each
-pickle are looked through first: only names that a state dict needs, and no more work than a small
-multiple of the file.
+file stand for. No file can change them. That does not stop a file from filling the memory or from
+taking hours, so each pickle's opcodes are checked first: only names that a state dict needs, only
+texts and short numbers as keys of dicts, and few bytes in all for texts that are used again.
 """
 
 from __future__ import annotations
@@ -31,18 +30,17 @@ from visloc.features.weights.pickled_pca import Pickled, PickledPca
 
 # A state dict with the state of an optimizer has some 10,000, a long training log 150,000.
 _MAX_OPCODES = 1_000_000
-_MAX_TUPLES = 10_000  # bounds how deep tuples can nest: hashing one recurses in C
-_SHORT_TEXT = 100
-# An object fetched from the memo may be as large as all of the pickle before it. Together those
-# fetched may have this many bytes, and so many more for each byte of the pickle.
-_MAX_FETCHED_BYTES, _MAX_FETCHED_SHARE = 64 * 2**20, 32
+# Of texts fetched from the memo: each fetched one may become bytes of its own.
+_MAX_FETCHED_BYTES = 64 * 2**20
+_MAX_MEMBERS = 10_000  # of a zip archive
+_MAX_INTEGER_BYTES = 8  # longer ones can be made to have equal hashes
 
 # What pickle writes in protocol 2, as far as torch reads it. Others name things in ways that are
 # not looked through here.
 _OPCODES = frozenset(
     (
         *("PROTO", "STOP", "MARK", "GLOBAL", "REDUCE", "NEWOBJ", "BUILD", "BINPERSID"),
-        *("EMPTY_DICT", "EMPTY_LIST", "EMPTY_TUPLE", "EMPTY_SET", "SETITEM", "SETITEMS"),
+        *("EMPTY_DICT", "EMPTY_LIST", "EMPTY_TUPLE", "SETITEM", "SETITEMS"),
         *("APPEND", "APPENDS", "TUPLE", "TUPLE1", "TUPLE2", "TUPLE3", "NONE", "NEWTRUE"),
         *("NEWFALSE", "BININT", "BININT1", "BININT2", "LONG1", "BINFLOAT", "BINUNICODE"),
         *("SHORT_BINSTRING", "BINPUT", "LONG_BINPUT", "BINGET", "LONG_BINGET"),
@@ -59,6 +57,8 @@ _OLD_LAYOUT_START = b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19.\x80\x02M\xe9\x03.
 _STATE_DICT_KEYS = ("state_dict", "model_state")
 _MAX_DIMENSIONS = 8
 
+_MARK = object()
+
 Numbers = Mapping[str, NDArray[Any]]
 """The numbers of each storage (n,), by its key."""
 
@@ -67,6 +67,9 @@ class _Dict(dict[Any, Any]):
     """Stands in for an ``OrderedDict``; torch puts a version of each module beside its items."""
 
     __slots__ = ()
+
+    def __init__(self) -> None:  # of another dict it would be a copy, in a few bytes of the file
+        super().__init__()
 
     def __setstate__(self, _: object) -> None:
         pass
@@ -77,7 +80,7 @@ class _DefaultDict(_Dict):
 
     __slots__ = ()
 
-    def __init__(self, _default_factory: object) -> None:
+    def __init__(self, _default_factory: object = None) -> None:
         super().__init__()
 
 
@@ -93,7 +96,7 @@ _TYPES = {
     "torch.HalfStorage": "<f2",
     "torch.LongStorage": "<i8",
 }
-# What each name makes. A pickle can set attributes of all that it gets hold of. So these are texts
+# What each name makes. A pickle can set attributes of any object it can reach. So these are texts
 # (the types of numbers), functions of C, and classes whose ``__setstate__`` keeps what is set.
 _KNOWN: Mapping[str, Any] = {
     "torch._utils._rebuild_tensor_v2": _Tensor,
@@ -133,8 +136,9 @@ class _Unpickler(pickle.Unpickler):
 
     def persistent_load(self, pid: Any) -> str:
         match pid:
-            case ("storage", str(kind), str(key), str(), int(count), *_) if (
+            case ("storage", str(kind), str(key), str(), int(count), *view) if (
                 kind in _TYPES.values()
+                and view in ([], [None])  # torch has not written views for long
                 and self.storages.setdefault(key, (kind, count)) == (kind, count)
             ):
                 return key
@@ -148,6 +152,8 @@ def _checked_name(name: str) -> str:
 
 
 def _read_zip(data: bytes) -> tuple[object, Numbers]:
+    if data.count(b"PK\x01\x02") > _MAX_MEMBERS:
+        raise ValueError(f"an archive of more than {_MAX_MEMBERS} members")
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         members = archive.infolist()
         # torch.save never compresses; members that unpack to more than the file are an attack.
@@ -219,32 +225,97 @@ def _keys(data: bytes, start: int) -> list[str]:
 
 def _check_pickle(data: bytes, start: int) -> int:
     """Refuse a pickle that no state dict needs; return where it ends."""
-    end = start
-    cheap: set[int] = set()  # memo entries of names and short texts, which everything fetches
-    fetched_bytes = num_tuples = 0
-    last_is_cheap = False
-    encoding = _Encoding()
-    for opcode, argument, end in _opcodes(data, start):
+    end, encoding, keys = start, _Encoding(), _Keys()
+    for opcode, argument, after in _opcodes(data, start):
+        end = after
         encoding.check(opcode, argument)
+        keys.check(opcode, argument)
         match opcode:
             case "GLOBAL":
                 _checked_name(argument.replace(" ", "."))
             case "BINPUT" | "LONG_BINPUT" if argument >= _MAX_OPCODES:
                 raise ValueError(f"memo entry {argument}")  # the unpickler makes room for all below
-            case "BINPUT" | "LONG_BINPUT":
-                (cheap.add if last_is_cheap else cheap.discard)(argument)
-            case "BINGET" | "LONG_BINGET" if argument not in cheap:
-                fetched_bytes += end - start
-            case "TUPLE" | "TUPLE1" | "TUPLE2" | "TUPLE3":
-                num_tuples += 1
-        last_is_cheap = opcode == "GLOBAL" or (
-            opcode == "BINUNICODE" and len(argument) <= _SHORT_TEXT
-        )
-    if num_tuples > _MAX_TUPLES:
-        raise ValueError(f"{num_tuples} tuples")
-    if fetched_bytes > _MAX_FETCHED_BYTES + _MAX_FETCHED_SHARE * (end - start):
-        raise ValueError("a pickle that uses the same objects again and again")
     return end
+
+
+class _Keys:
+    """Refuses dicts whose keys are not texts or numbers, and too many bytes of fetched texts.
+
+    A key is hashed: of a tuple that holds the same tuples again and again, that takes forever, and
+    of many keys with equal hashes the square of their number.
+    """
+
+    def __init__(self) -> None:
+        # What the unpickler's stack holds: the bytes of a text, 0 for a number, None for anything
+        # else, and _MARK.
+        self._stack: list[int | object | None] = []
+        self._memo: dict[int, int | object | None] = {}
+        self._fetched_bytes = 0
+
+    def check(self, opcode: str, argument: Any) -> None:
+        """Take the next opcode of a pickle."""
+        stack = self._stack
+        match opcode:
+            case "PROTO" | "STOP":
+                pass
+            case "MARK":
+                stack.append(_MARK)
+            case "BINUNICODE" | "SHORT_BINSTRING":
+                stack.append(len(argument))
+            case "BININT" | "BININT1" | "BININT2" | "LONG1":
+                if argument.bit_length() >= 8 * _MAX_INTEGER_BYTES:
+                    raise ValueError("a whole number of more than 8 bytes")
+                stack.append(0)
+            case "BINPUT" | "LONG_BINPUT":
+                if stack[-1] is _MARK:
+                    raise ValueError("a pickle that keeps what is not there")
+                self._memo[argument] = stack[-1]
+            case "BINGET" | "LONG_BINGET":
+                stack.append(self._memo[argument])
+                if isinstance(stack[-1], int):
+                    self._fetched_bytes += stack[-1]
+                if self._fetched_bytes > _MAX_FETCHED_BYTES:
+                    raise ValueError("a pickle that uses the same texts again and again")
+            case "TUPLE":
+                self._above_mark()
+                stack.append(None)
+            case "TUPLE1" | "TUPLE2" | "TUPLE3":
+                self._popped(int(opcode[-1]))
+                stack.append(None)
+            case "REDUCE" | "NEWOBJ":
+                self._popped(2)
+                stack.append(None)
+            case "BINPERSID":
+                self._popped(1)
+                stack.append(None)
+            case "APPEND" | "BUILD":
+                self._popped(1)
+            case "APPENDS":
+                self._above_mark()
+            case "SETITEM":
+                self._check_keys(self._popped(2))
+            case "SETITEMS":
+                self._check_keys(self._above_mark())
+            case _:  # GLOBAL, floats, truths, None, empty containers
+                stack.append(None)
+
+    def _popped(self, count: int) -> list[int | object | None]:
+        if len(self._stack) < count or _MARK in self._stack[-count:]:
+            raise ValueError("a pickle that takes more than there is")
+        popped = self._stack[-count:]
+        del self._stack[-count:]
+        return popped
+
+    def _above_mark(self) -> list[int | object | None]:
+        above = []
+        while (top := self._stack.pop()) is not _MARK:
+            above.append(top)
+        return above[::-1]
+
+    @staticmethod
+    def _check_keys(items: list[int | object | None]) -> None:
+        if not all(isinstance(key, int) for key in items[::2]):
+            raise ValueError("a dict whose keys are neither texts nor numbers")
 
 
 class _Encoding:
@@ -322,10 +393,10 @@ def _state_dict(content: object, numbers: Numbers) -> dict[str, NDArray[Any]]:
 
 def _array(name: str, tensor: _Tensor, numbers: Numbers) -> NDArray[Any]:
     match tensor.arguments:
-        case (str(key), int(first), tuple(shape), tuple(strides), bool(), *_) if len(shape) == len(
-            strides
-        ) <= _MAX_DIMENSIONS and all(
-            type(each) is int and each >= 0 for each in (first, *shape, *strides)
+        case (str(key), int(first), tuple(shape), tuple(strides), bool(), _, *other) if (
+            other in ([], [None], [{}])  # else, such as a sign that is turned
+            and len(shape) == len(strides) <= _MAX_DIMENSIONS
+            and all(type(each) is int and each >= 0 for each in (first, *shape, *strides))
         ):
             pass
         case _:
@@ -334,7 +405,7 @@ def _array(name: str, tensor: _Tensor, numbers: Numbers) -> NDArray[Any]:
         raise ValueError(f"storage {key:.20} without numbers")
     found = numbers[key]
     last = first + sum((side - 1) * stride for side, stride in zip(shape, strides, strict=True))
-    if prod(shape) and last >= len(found):
+    if prod(shape) > len(found) or (prod(shape) and last >= len(found)):
         raise ValueError(f"tensor {name:.60} reaches beyond its storage of {len(found)} numbers")
     item = found.itemsize
     return as_strided(found[first:], shape, [item * stride for stride in strides], writeable=False)

@@ -186,7 +186,7 @@ def test_names_beside_the_known_ones_are_refused(
         (_dict_of(b"\x8d" + b"\xff" * 8), "byte count"),
         (_dict_of(b"\x8e" + b"\xff" * 7 + b"\x00"), "only"),
         (_dict_of(b"cbuiltins\nlist\n(]tR"), f"holds Pickled|{NO_STORAGE}"),
-        (_dict_of(b"ccollections\nOrderedDict\n(]tR"), f"holds Dict|{NO_STORAGE}"),
+        (_dict_of(b"ccollections\nOrderedDict\n(]tR"), "takes 1 positional argument"),
         # one list copied again and again, a few bytes each
         (
             b"\x80\x02ccollections\nOrderedDict\nq\x00]q\x01("
@@ -194,10 +194,10 @@ def test_names_beside_the_known_ones_are_refused(
             + b"e("
             + b"h\x00h\x01\x85R" * 6000
             + b"t.",
-            "again and again",
+            "again and again|1 positional argument|more than",
         ),
         # hashing a tuple as deep as this ends the process
-        (b"\x80\x02})" + b"\x85" * 100_000 + b"K\x01s.", "tuples"),
+        (b"\x80\x02})" + b"\x85" * 100_000 + b"K\x01s.", "keys are neither"),
         # an empty list is one byte here and 56 in memory
         (b"\x80\x02(" + b"]" * 1_000_000 + b"t.", "more than 1000000 opcodes"),
     ],
@@ -245,6 +245,75 @@ def test_a_file_cannot_change_what_names_stand_for(name: str, state: bytes, tmp_
     with pytest.raises(WeightsError):
         read_checkpoint(_zip_file(tmp_path / "w.pt", content))
     assert not hasattr(_KNOWN[name], "a")
+
+
+def _doubled(tuples: int) -> bytes:
+    """A tuple of the one before, twice, and so on: hashing it takes two to that power."""
+    steps = [b"N\x85q\x00"]
+    for number in range(tuples):
+        old, new = bytes([number]), bytes([number + 1])
+        steps.append(b"h" + old + b"h" + old + b"\x86q" + new)
+    return b"(" + b"".join(steps) + b"t"
+
+
+@WRITERS
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"\x80\x02}" + _doubled(60) + b"K\x01s.",
+        b"\x80\x02}(" + _doubled(60) + b"K\x01u.",
+        # numbers with equal hashes
+        b"\x80\x02}(" + b"\x8a\x09" + (2**64 + 7).to_bytes(9, "little") + b"K\x01u.",
+        # a mark that is kept, so that keys and values change places
+        b"\x80\x02}(q\x00)K\x01u.",
+    ],
+)
+def test_keys_that_take_forever_are_refused(content: bytes, write: Writer, tmp_path: Path) -> None:
+    with pytest.raises(WeightsError, match=r"keys are neither|more than 8 bytes|not there"):
+        read_checkpoint(write(tmp_path / "w.pt", content))
+
+
+def test_a_text_that_becomes_bytes_again_and_again_is_refused_whatever_follows(
+    tmp_path: Path,
+) -> None:
+    text = b"X" + struct.pack("<I", 2**20) + b"a" * 2**20 + b"q\x01"
+    encoded = b"c_codecs\nencode\nh\x01X\x06\x00\x00\x00latin1\x86R"
+    content = b"\x80\x02}(" + b"X\x01\x00\x00\x00a" + text
+    content += b"".join(b"K%c" % number + encoded for number in range(80))
+    padding = b"X\x01\x00\x00\x00zX" + struct.pack("<I", 2**23) + b"z" * 2**23
+    with pytest.raises(WeightsError, match="again and again"):
+        read_checkpoint(_zip_file(tmp_path / "w.pt", content + padding + b"u."))
+
+
+@WRITERS
+@pytest.mark.parametrize(
+    ("tensor", "reason"),
+    [
+        # of one number, without strides
+        (_tensor().replace(b"(K\x02t(K\x01t", b"(J\x00\x00\x00\x40t(K\x00t"), "beyond"),
+        (_tensor().replace(b")RtR", b")R}X\x03\x00\x00\x00neg\x88stR"), "describes none"),
+    ],
+)
+def test_tensors_that_are_more_than_their_numbers_are_refused(
+    tensor: bytes, reason: str, write: Writer, tmp_path: Path
+) -> None:
+    with pytest.raises(WeightsError, match=reason):
+        read_checkpoint(write(tmp_path / "w.pt", _dict_of(tensor)))
+
+
+def test_views_of_storages_are_refused(tmp_path: Path) -> None:
+    view = _tensor().replace(b"NtQ", b"(X\x01\x00\x00\x008K\x01K\x01ttQ")
+    with pytest.raises(WeightsError, match="named as torch names none"):
+        read_checkpoint(_old_file(tmp_path / "w.pt", _dict_of(view)))
+
+
+def test_archives_of_very_many_members_are_refused_unread(tmp_path: Path) -> None:
+    path = _zip_file(tmp_path / "w.pt", _dict_of(_tensor()))
+    with zipfile.ZipFile(path, "a") as archive:
+        for number in range(10_000):
+            archive.writestr(f"archive/{number}", b"")
+    with pytest.raises(WeightsError, match="more than 10000 members"):
+        read_checkpoint(path)
 
 
 @WRITERS

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
+
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -15,11 +17,14 @@ from visloc.features.networks.xfeat.model import CELL_PX, LAYERS, XFeatNetwork
 
 
 class XFeatModule(nn.Module):
-    """The network, its tensors named by ``LAYERS`` and their number."""
+    """The network as a module, with the convolutions of ``LAYERS`` in their order."""
 
     def __init__(self, network: XFeatNetwork) -> None:
         super().__init__()
         self.convolutions = nn.ModuleList(map(torch_convolution, network.convolutions))
+        self._blocks: dict[str, list[tuple[nn.Module, bool]]] = defaultdict(list)
+        for layer, convolution in zip(LAYERS, self.convolutions, strict=True):
+            self._blocks[layer.block].append((convolution, layer.normalized))
 
     def network(self) -> XFeatNetwork:
         """Return the network with the numbers that it has now."""
@@ -49,10 +54,9 @@ class XFeatModule(nn.Module):
         return features, logits, reliability
 
     def _block(self, name: str, x: Tensor) -> Tensor:
-        for layer, convolution in zip(LAYERS, self.convolutions, strict=True):
-            if layer.block == name:
-                x = convolution(x)
-                x = F.relu(x, inplace=True) if layer.normalized else x
+        for convolution, relu in self._blocks[name]:
+            x = convolution(x)
+            x = F.relu(x, inplace=True) if relu else x
         return x
 
 

@@ -1,0 +1,8 @@
+"""Preparation of the process that a build's workers are forked from; imported only there."""
+
+from __future__ import annotations
+
+import mapping.build.build  # noqa: F401  what tasks of a build need
+from visloc.preloading import load_torch_if_sure
+
+load_torch_if_sure()
