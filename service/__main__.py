@@ -38,7 +38,7 @@ def main() -> None:
         sys.exit(f"visloc-service: {error}")
     # Libraries read these once when they are loaded: hence the late import below.
     os.environ.setdefault("OMP_NUM_THREADS", str(settings.threads_per_worker))
-    # OpenVINO and compiled matching do the heavy work. OpenBLAS's threads would spin while they wait
+    # OpenVINO and compiled matching do the heavy work. OpenBLAS's threads would spin as they wait
     # for each other, on cores that these need.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(settings.max_image_pixels))

@@ -21,7 +21,7 @@ from threadpoolctl import threadpool_limits
 from mapping.cluster.stage_timings import Spent, spent_here
 from mapping.progress import ItemProgress, Progress
 from visloc.errors import refuse
-from visloc.threads import threads
+from visloc.threads import threads, use_threads
 
 S = TypeVar("S")
 T = TypeVar("T")
@@ -187,6 +187,7 @@ def _start_worker(sockets: str | None) -> None:
     """Begin a worker of a build that has a folder of sockets of its own, or None."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     threading.Thread(target=_end_with_parent, args=(sockets,), daemon=True).start()
+    use_threads(1)
 
 
 def _end_with_parent(sockets: str | None) -> None:

@@ -79,7 +79,7 @@ def read_checkpoint(
 
     Args:
         path: the file.
-        max_bytes: how large it may be.
+        max_bytes: how large it may be, and the tensors of a state dict together.
         sha256: of the only file that will do; checked before anything is read out of it.
 
     Raises:
@@ -103,7 +103,7 @@ def read_checkpoint(
     try:
         if data[_SAFETENSORS_LENGTH_BYTES : _SAFETENSORS_LENGTH_BYTES + 1] == b"{":
             return Checkpoint(path, found_sha256, _read_safetensors(data))
-        return Checkpoint(path, found_sha256, *read_torch_file(data))
+        return Checkpoint(path, found_sha256, *read_torch_file(data, max_bytes))
     except _MALFORMED as error:
         raise refuse(
             "weights.format", field=str(path), got=f"{type(error).__name__}: {error}"

@@ -110,14 +110,23 @@ _KNOWN: Mapping[str, Any] = {
 }
 
 
-def read_torch_file(data: bytes) -> tuple[dict[str, NDArray[Any]], dict[str, PickledPca]]:
+def read_torch_file(
+    data: bytes, max_bytes: int
+) -> tuple[dict[str, NDArray[Any]], dict[str, PickledPca]]:
     """Return the tensors of the state dict, read-only, and the PCAs of scikit-learn beside it.
+
+    Args:
+        data: the file.
+        max_bytes: of all tensors; in the file, the numbers of one may stand for many.
 
     Raises:
         ValueError, TypeError and others that damaged files lead to; see ``checkpoint``.
     """
     content, numbers = _read_zip(data) if data[:2] == b"PK" else _read_old_layout(data)
-    return _state_dict(content, numbers), _pca_of(content)
+    tensors = _state_dict(content, numbers)
+    if sum(array.nbytes for array in tensors.values()) > max_bytes:
+        raise ValueError(f"tensors of more than {max_bytes} bytes together")
+    return tensors, _pca_of(content)
 
 
 class _Unpickler(pickle.Unpickler):
@@ -405,7 +414,7 @@ def _array(name: str, tensor: _Tensor, numbers: Numbers) -> NDArray[Any]:
         raise ValueError(f"storage {key:.20} without numbers")
     found = numbers[key]
     last = first + sum((side - 1) * stride for side, stride in zip(shape, strides, strict=True))
-    if prod(shape) > len(found) or (prod(shape) and last >= len(found)):
+    if prod(shape) and last >= len(found):
         raise ValueError(f"tensor {name:.60} reaches beyond its storage of {len(found)} numbers")
     item = found.itemsize
     return as_strided(found[first:], shape, [item * stride for stride in strides], writeable=False)
