@@ -28,14 +28,17 @@ def use_threads(count: int) -> None:
 
 
 def count_of_threads() -> int:
-    """Return torch's number if it is loaded, else ``OMP_NUM_THREADS`` or one for each processor."""
+    """Return torch's number if it is loaded, else ``OMP_NUM_THREADS``; at most the processors."""
     torch = loaded_torch()
     if torch is not None:
         return int(torch.get_num_threads())
-    asked = os.environ.get(_VARIABLE, "").partition(",")[0]
-    if asked.isdecimal() and int(asked) > 0:
-        return int(asked)
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    can_tell = hasattr(os, "sched_getaffinity")
+    processors = len(os.sched_getaffinity(0)) if can_tell else os.cpu_count() or 1
+    try:
+        asked = int(os.environ.get(_VARIABLE, "").partition(",")[0])
+    except ValueError:
+        return processors
+    return min(asked, processors) if asked > 0 else processors
 
 
 def loaded_torch() -> ModuleType | None:
