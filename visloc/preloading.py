@@ -1,4 +1,4 @@
-"""What a process loads from which others are forked: once, in memory that they share."""
+"""Loads torch once in a process from which others are forked, so that they share its memory."""
 
 from __future__ import annotations
 

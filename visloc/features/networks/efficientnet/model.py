@@ -49,7 +49,7 @@ class _Layer(NamedTuple):
     """A convolution without its numbers.
 
     Attributes:
-        name: of its weight.
+        name: the published name of its weight.
         batch_norm: name of the batch norm that follows.
         shape: of its weight, (O, I / groups, k, k).
         stride: in both directions.

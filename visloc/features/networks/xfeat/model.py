@@ -51,17 +51,17 @@ class Layer(NamedTuple):
 
     @property
     def name(self) -> str:
-        """In the network, as published."""
+        """Its published name."""
         return f"{self.block}.{self.number}" + (".layer" if self.normalized else "")
 
     @property
     def convolution(self) -> str:
-        """What the names of its weight and bias begin with, as published."""
+        """The prefix of the published names of its weight and bias."""
         return f"{self.name}.0" if self.normalized else self.name
 
     @property
     def batch_norm(self) -> str:
-        """What the names of its batch norm begin with, as published."""
+        """The prefix of the published names of its batch norm."""
         return f"{self.name}.1"
 
     @property
