@@ -2,8 +2,11 @@ from __future__ import annotations
 
 import ctypes
 import json
+import os
+import pickle
 import shutil
 from collections.abc import Callable, Sequence
+from operator import methodcaller
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -23,12 +26,14 @@ from service.workers import open_maps as opening
 from service.workers import vision
 from service.workers.open_maps import OpenMaps
 from service.workers.photos import DecodedQuery
+from service.workers.process import _reply_to
 from service.workers.vision import Vision
 from visloc.archive import MapStore
 from visloc.errors import Conflict, InvalidInput, NotFound, WeightsError
 from visloc.features import GlobalDescriptor, make_global_descriptor
 from visloc.options import Inference, LocalizeOptions, Matcher, Solver
 from visloc.priors import NO_PRIORS
+from visloc.threads import count_of_threads, threads
 from visloc.types import QueryFeatures
 
 WEIGHTS = Path("weights")
@@ -51,6 +56,16 @@ def test_global_descriptors_are_made_once_for_all_maps_with_the_settings(
         maps.localizer(MapFolder(ref, folder))
     settings = (WEIGHTS, Inference.FP32, 1)
     assert made == [("densevlad", *settings), ("localvlad", *settings)]
+
+
+def test_a_task_computes_with_the_threads_that_it_was_given() -> None:
+    one = Vision(SETTINGS, ctypes.c_bool(False))
+    with threads(2):
+        reply = pickle.loads(_reply_to(pickle.dumps((methodcaller("ping"), 1)), one))
+        assert reply.result == os.getpid()
+        assert count_of_threads() == 1
+        _reply_to(pickle.dumps((methodcaller("ping"), 2)), one)
+        assert count_of_threads() == min(2, len(os.sched_getaffinity(0)))
 
 
 def test_a_map_whose_descriptor_has_no_weights_here_is_a_conflict(

@@ -144,7 +144,7 @@ def make_vgg16(checkpoint: Checkpoint) -> nn.Sequential:
         for _ in widths:
             name = f"encoder.{len(steps)}"
             weight, bias = (
-                checkpoint.tensors[f"{name}.{part}"].astype(np.float32)
+                np.asarray(checkpoint.tensors[f"{name}.{part}"], np.float32)
                 for part in ("weight", "bias")
             )
             convolution = torch_convolution(Convolution(weight, bias, padding=(1, 1)))
