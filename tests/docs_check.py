@@ -289,6 +289,11 @@ def _parse_service(arguments: Sequence[str]) -> None:
 
 
 def _parse_python(arguments: Sequence[str]) -> None:
+    if arguments[0] == "-X":
+        arguments = arguments[2:]
+    if arguments[0] == "-c":
+        compile(arguments[1], "-c", "exec")
+        return
     if arguments[0] == "-m":
         name, given = arguments[1], arguments[2:]
     else:

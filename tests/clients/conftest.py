@@ -102,14 +102,15 @@ class CannedService:
     """What a photo's bytes begin with decides what becomes of it; features give ``POSE``.
 
     ``refuse``: not localized; ``broken``, ``huge``, ``crash``: errors; ``busy``: overloaded twice;
-    ``slow``: waits; ``gone``, ``weights``, ``preset``: errors of all photos; JSON: the pose to
-    answer; else: ``POSE``.
+    ``slow``: waits until told to hurry; ``gone``, ``weights``, ``preset``: errors of all photos;
+    JSON: the pose to answer; else: ``POSE``.
     """
 
     version: str = "v1"
     seen: list[dict[str, Any]] = field(default_factory=list)
     is_ready: bool = True
     slow_s: float = 0.3
+    hurry: threading.Event = field(default_factory=threading.Event)
     busy: Counter[bytes] = field(default_factory=Counter)
     local_features: str = "xfeat"
     global_features: tuple[str, ...] = ("densevlad", "localvlad")
@@ -138,7 +139,7 @@ class CannedService:
             case b"preset":
                 raise InvalidInput("options.preset", "unknown preset", field="options.preset")
             case b"slow":
-                time.sleep(self.slow_s)
+                self.hurry.wait(self.slow_s)
             case b"busy":
                 self.busy[image] += 1
                 if self.busy[image] <= 2:
@@ -206,7 +207,7 @@ class CannedService:
                 if self.busy[content] <= 2:
                     raise Overloaded("server.busy", "too many requests are waiting")
             elif content.startswith(b"slow"):
-                time.sleep(self.slow_s)
+                self.hurry.wait(self.slow_s)
             elif content.startswith((b"{", b"photo", b"filled")) and rig_from_world is None:
                 pose = json.loads(content) if content.startswith(b"{") else POSE["cam_from_world"]
                 cam_from_world = Pose.from_quaternion(**pose)

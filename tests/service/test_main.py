@@ -15,7 +15,7 @@ import grpc
 import httpx
 import pytest
 
-from service.server import Server
+from service.server import Server, _listen
 from service.settings import ServiceSettings, SettingsError
 from visloc_api.v1 import localization_pb2 as pb2
 from visloc_api.v1.localization_pb2_grpc import LocalizationStub
@@ -122,6 +122,15 @@ def test_what_is_no_folder_is_refused_by_name(name: str, tmp_path: Path) -> None
         given: dict[str, Any] = {"maps_dir": tmp_path, name: path}
         with pytest.raises(SettingsError, match=f"{name}: .* is no folder"):
             Server(ServiceSettings(**given, http_port=0, grpc_port=0))
+
+
+def test_answers_on_a_connection_that_is_kept_do_not_wait_for_acknowledgements() -> None:
+    with (
+        _listen("127.0.0.1", 0) as listener,
+        socket.create_connection(listener.getsockname()),
+        listener.accept()[0] as accepted,
+    ):
+        assert accepted.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
 
 
 @pytest.mark.parametrize("taken", ["http_port", "grpc_port"])

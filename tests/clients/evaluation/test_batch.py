@@ -280,7 +280,7 @@ def test_a_stopped_run_keeps_what_is_done_and_goes_on_later(
 ) -> None:
     photos = {name: name.encode() for name in "abcdef"} | {"d": b"slow"}
     dataset, output = make_dataset(photos), tmp_path / "out"
-    service.slow_s = 5.0
+    service.slow_s = 120.0
     command = (dataset, "--map", "room", "--output", output, "--server", url, "--concurrency", 2)
     # A shell starts what it runs in the background with SIGINT ignored, tests perhaps too.
     heed_sigint = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
@@ -295,16 +295,14 @@ def test_a_stopped_run_keeps_what_is_done_and_goes_on_later(
     while not (results.exists() and results.read_bytes().count(b"\n") == 5):
         assert time.monotonic() < deadline
         time.sleep(0.02)
-    started = time.monotonic()
     process.send_signal(number)
-    _, error = process.communicate(timeout=10)
+    _, error = process.communicate(timeout=60)  # or it waited for the photo under way
 
     assert process.returncode == code
-    assert time.monotonic() - started < 4, "waited for the photo under way"
     assert b"Traceback" not in error
     assert sorted(line["name"] for line in lines_of(output)) == list("abcef")
     assert not (output / "poses.txt").exists()
-    service.slow_s = 0.0
+    service.hurry.set()
     service.seen.clear()
     assert batch(*command) == 0
     assert asked(service) == [b"slow"]
