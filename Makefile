@@ -74,7 +74,7 @@ demo: install ## the main job on a synthetic sample: build, serve, localize, pic
 	$(BIN)/python examples/demo.py
 
 test: install browser balancer promtool ## the tests, in about twelve minutes on two cores
-	$(BIN)/pytest -m 'not slow' --numprocesses 2 --dist loadfile --no-loadscope-reorder
+	$(BIN)/pytest -m 'not slow' --numprocesses 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 1
 
 test-all: install browser balancer promtool ## the slow tests too
 	$(BIN)/pytest
