@@ -105,6 +105,17 @@ def test_a_pair_is_believed_when_third_photos_link_the_same_keypoints() -> None:
     assert another not in without_look_alikes(photos, [*pairs.values(), another])
 
 
+def test_a_pair_of_two_places_that_lacks_nothing_is_left_out() -> None:
+    two, one = (
+        {(p.first, p.second): p for p in matches_of(make_hallways(share), share)}
+        for share in (0.08, 1.0)
+    )
+    photos = make_hallways(1.0)
+    some = {rows: one[rows] for rows in ((2, 13), (2, 12), (3, 13))}
+    assert some[2, 13] in without_look_alikes(photos, [*one.values()])
+    assert some[2, 13] not in without_look_alikes(photos, [*(two | some).values()])
+
+
 def test_two_photos_alone_are_believed() -> None:
     photos = make_hallways(0.2)
     (pair,) = [p for p in matches_of(photos, 0.2) if (p.first, p.second) == (0, 7)]
