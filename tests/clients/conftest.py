@@ -102,8 +102,8 @@ class CannedService:
     """What a photo's bytes begin with decides what becomes of it; features give ``POSE``.
 
     ``refuse``: not localized; ``broken``, ``huge``, ``crash``: errors; ``busy``: overloaded twice;
-    ``slow``: waits until told to hurry; ``gone``, ``weights``, ``preset``: errors of all photos;
-    JSON: the pose to answer; else: ``POSE``.
+    ``slow``: waits ``slow_s``, or until ``hurry``; ``gone``, ``weights``, ``preset``: errors of all
+    photos; JSON: the pose to answer; else: ``POSE``.
     """
 
     version: str = "v1"
@@ -333,11 +333,12 @@ class CannedService:
 
 
 @pytest.fixture(autouse=True)
-def service(_servers: tuple[CannedService, str, str]) -> CannedService:
+def service(_servers: tuple[CannedService, str, str]) -> Iterator[CannedService]:
     """The canned service, as new."""
     canned = _servers[0]
     canned.__init__()  # type: ignore[misc]
-    return canned
+    yield canned
+    canned.hurry.set()
 
 
 @pytest.fixture

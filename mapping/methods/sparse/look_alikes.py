@@ -15,9 +15,9 @@ taken far apart. So there are two exceptions:
   believed pair links. Nor does it pass repetitions within a place: over a third photo, the first
   door in a row does not lead to the second.
 
-A few pairs of two places have all that they should: those of photos that show nothing but what both
-places have. Photos taken just before and after show more. So a pair is not believed if most matches
-between those photos are of pairs that fail.
+Some pairs of two places lack nothing, because their photos show only what both places have. Photos
+taken just before and after show more. So unless its photos were taken one shortly after the other,
+a pair is not believed if most matches between these neighbours are of pairs that fail.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ _CONFIRMING = 4
 # at most so many steps, and of all others. Measured: benchmarks/joining.py.
 _NEAR_STEPS = 3
 _LEAST_NEAR, _LEAST_FAR = 0.1, 0.3
-# Least share of such matches that are of pairs that do not fail. With the painted rooms of
-# tests/mapping/methods/test_painted_places.py it is 0 for pairs of two rooms, and 0.76 to 0.96 for
-# pairs of two walks through one room.
+# Least share, counted in matches, of the pairs that pass among those of the neighbours of a pair's
+# photos in time. In eight painted rooms it was 0 for pairs of two rooms, and 0.76 to 0.96 for pairs
+# of two walks through one (tests/mapping/methods/test_painted_places.py makes such walks).
 _LEAST_AROUND = 0.5
 # Fewest matches of a pair that third photos must agree with.
 _MIN_AGREEING = 15
@@ -69,11 +69,11 @@ def without_look_alikes(
     order = ranks_in_time(photos)
     near = [_are_near(photos, order, pair) for pair in matches]
     passing = []
-    for done, pair in enumerate(matches):
+    for done, (pair, is_near) in enumerate(zip(matches, near, strict=True)):
         progress(done, len(matches))
-        least = _LEAST_NEAR if near[done] else _LEAST_FAR
+        least = _LEAST_NEAR if is_near else _LEAST_FAR
         passing.append(_share_found(photos, confirmed, pair) >= least)
-    around = _Around(photos, order, matches, passing)
+    around = _Around(photos, order, matches, passing, near)
     believed = [
         passes and (is_near or around.share_passing(pair) >= _LEAST_AROUND)
         for pair, passes, is_near in zip(matches, passing, near, strict=True)
@@ -126,7 +126,7 @@ class _Links:
 
 
 class _Around:
-    """Which pairs pass among those of the photos near both of a pair in time."""
+    """The pairs between the neighbours of a pair's photos in time, but not those near in time."""
 
     def __init__(
         self,
@@ -134,26 +134,36 @@ class _Around:
         order: Sequence[int],
         matches: Sequence[Matches],
         passing: Sequence[bool],
+        near: Sequence[bool],
     ) -> None:
         self._places = [(photo.sensor, rank) for photo, rank in zip(photos, order, strict=True)]
         self._photos = {place: row for row, place in enumerate(self._places)}
         self._pairs = {
             frozenset((pair.first, pair.second)): (len(pair.rows), passes)
-            for pair, passes in zip(matches, passing, strict=True)
+            for pair, passes, is_near in zip(matches, passing, near, strict=True)
+            if not is_near
         }
 
     def share_passing(self, pair: Matches) -> float:
-        """Return the share, counted in matches, without the pair itself; 1 if there are none."""
-        beside = set(map(frozenset, product(self._near(pair.first), self._near(pair.second))))
+        """Return the share of those that pass, counted in matches; 1 if there are none."""
+        sides = self._beside(pair.first, pair.second), self._beside(pair.second, pair.first)
+        beside = set(map(frozenset, product(*sides)))
         beside.discard(frozenset((pair.first, pair.second)))
         found = [self._pairs[each] for each in beside if each in self._pairs]
         number = sum(matched for matched, _ in found)
         return sum(matched for matched, passes in found if passes) / number if number else 1.0
 
-    def _near(self, photo: int) -> list[int]:
+    def _beside(self, photo: int, other: int) -> list[int]:
+        """Return a photo and its neighbours in time, as far as they are not nearer to the other."""
         sensor, rank = self._places[photo]
+        other_sensor, other_rank = self._places[other]
         ranks = range(rank - _NEAR_STEPS, rank + _NEAR_STEPS + 1)
-        return [self._photos[sensor, near] for near in ranks if (sensor, near) in self._photos]
+        return [
+            self._photos[sensor, near]
+            for near in ranks
+            if (sensor, near) in self._photos
+            and (sensor != other_sensor or abs(near - rank) <= abs(near - other_rank))
+        ]
 
 
 class _Confirmed:

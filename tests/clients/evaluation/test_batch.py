@@ -296,7 +296,7 @@ def test_a_stopped_run_keeps_what_is_done_and_goes_on_later(
         assert time.monotonic() < deadline
         time.sleep(0.02)
     process.send_signal(number)
-    _, error = process.communicate(timeout=60)  # or it waited for the photo under way
+    _, error = process.communicate(timeout=60)  # the photo under way takes 120
 
     assert process.returncode == code
     assert b"Traceback" not in error

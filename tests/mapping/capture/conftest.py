@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,23 @@ def panned(count: int, step: int, size: tuple[int, int] = (320, 240)) -> list[Pi
     return [wall[:, i * step : i * step + width].copy() for i in range(count)]
 
 
+@contextmanager
+def _priority_kept() -> Iterator[None]:
+    """Set the priority of this thread back.
+
+    As root, SVT-AV1 gives the thread that calls it real-time priority 99, for good. Threads and
+    processes started later inherit that, and starve all others.
+    """
+    if not hasattr(os, "sched_setscheduler"):  # macOS
+        yield
+        return
+    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, policy, parameters)
+
+
 @pytest.fixture
 def make_video(tmp_path: Path) -> Callable[..., Path]:
     """Encode pictures: ``make_video(pictures, name=..., codec=..., times=..., tags=...)``."""
@@ -49,7 +67,10 @@ def make_video(tmp_path: Path) -> Callable[..., Path]:
         **context: Any,
     ) -> Path:
         path = tmp_path / name
-        with av.open(str(path), "w", options={"movflags": "use_metadata_tags"}) as container:
+        with (
+            _priority_kept(),
+            av.open(str(path), "w", options={"movflags": "use_metadata_tags"}) as container,
+        ):
             container.metadata.update(tags or {})
             stream = container.add_stream(codec, rate=10)
             assert isinstance(stream, av.VideoStream)
@@ -65,10 +86,6 @@ def make_video(tmp_path: Path) -> Callable[..., Path]:
                 frame.time_base = Fraction(1, 1000)
                 container.mux(stream.encode(frame))
             container.mux(stream.encode())
-        if hasattr(os, "sched_setscheduler"):
-            # SVT-AV1 gives the thread that calls it the highest priority of all if it may, for
-            # good. Threads that the tests start later had it too, and others waited for ever.
-            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         return path
 
     return make

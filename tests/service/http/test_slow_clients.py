@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
 
 import h11
@@ -53,7 +53,13 @@ async def small(_: Request) -> Response:
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[tuple[int, Arrivals]]:
-    arrivals = Arrivals(GRACE_S, BUDGET)
+    with serving(GRACE_S) as made:
+        yield made
+
+
+@contextmanager
+def serving(grace_s: float) -> Iterator[tuple[int, Arrivals]]:
+    arrivals = Arrivals(grace_s, BUDGET)
     methods = ["GET", "POST"]
     routes = [Route(f"/{do.__name__}", do, methods=methods) for do in (read, refuse, long)]
     app = Starlette(routes=routes)
@@ -63,7 +69,7 @@ def server() -> Iterator[tuple[int, Arrivals]]:
         port=0,
         log_level="critical",
         lifespan="off",
-        http=http_protocol(GRACE_S, OpenConnections(1000)),
+        http=http_protocol(grace_s, OpenConnections(1000)),
     )
     running = uvicorn.Server(config)
     thread = threading.Thread(target=running.run)
@@ -105,7 +111,7 @@ def one_answer(connection: socket.socket) -> bytes:
 
 
 def dribble(connection: socket.socket, data: bytes, every_s: float = GRACE_S / 12) -> bool:
-    """Send one byte after the other; whether somebody took them all."""
+    """Send one byte after the other; return whether all were taken."""
     try:
         for i in range(len(data)):
             connection.sendall(data[i : i + 1])
@@ -128,33 +134,33 @@ def wait_until_idle(arrivals: Arrivals) -> None:
 
 
 def test_a_head_that_comes_byte_by_byte_is_not_waited_for(server: tuple[int, Arrivals]) -> None:
+    started = time.monotonic()
     with connected(server[0]) as connection:
-        started = time.monotonic()
         assert not dribble(connection, b"GET /read HTTP/1.1\r\nHost: " + b"a" * 1000)
-        assert time.monotonic() - started > GRACE_S - 0.1
+        assert time.monotonic() - started >= GRACE_S
 
 
 @pytest.mark.parametrize("sent", [b"", b"GET"])
 def test_a_connection_that_says_nothing_more_is_closed(
     server: tuple[int, Arrivals], sent: bytes
 ) -> None:
+    started = time.monotonic()
     with connected(server[0]) as connection:
-        started = time.monotonic()
         connection.sendall(sent)
 
         assert answer_of(connection) == b""
-        assert time.monotonic() - started > GRACE_S - 0.1
+        assert time.monotonic() - started >= GRACE_S
 
 
 def test_the_head_of_a_second_request_is_not_waited_for_either(
     server: tuple[int, Arrivals],
 ) -> None:
     with connected(server[0]) as connection:
+        started = time.monotonic()
         connection.sendall(head("/refuse", 0))
         assert one_answer(connection).endswith(b"no")
-        started = time.monotonic()
         assert not dribble(connection, b"GET /read HTTP/1.1\r\nHost: " + b"a" * 1000)
-        assert time.monotonic() - started > GRACE_S - 0.1
+        assert time.monotonic() - started >= GRACE_S
 
 
 def test_requests_one_after_the_other_are_not_cut_off(server: tuple[int, Arrivals]) -> None:
@@ -373,30 +379,9 @@ def test_an_answer_that_is_taken_slowly_comes_whole(server: tuple[int, Arrivals]
         assert time.monotonic() - started > 0.3
 
 
-def test_two_hundred_that_dribble_do_not_hold_up_the_others(
-    server: tuple[int, Arrivals],
-) -> None:
-    port, _ = server
-
-    stop = threading.Event()
-
-    def slow() -> None:
-        while not stop.is_set():
-            with connected(port) as connection:
-                connection.sendall(b"POST /read HT")
-                while not stop.wait(0.25):
-                    try:
-                        connection.sendall(b"T")
-                    except OSError:
-                        break
-
-    url = f"http://127.0.0.1:{port}/read"  # how long answers take is in docs/reliability.md
-    with ThreadPoolExecutor(200) as pool:
+def test_two_hundred_that_have_said_nothing_yet_do_not_hold_up_the_others() -> None:
+    with serving(600) as (port, _), ExitStack() as silent:
         for _ in range(200):
-            pool.submit(slow)
-        time.sleep(0.3)
-        try:
-            for _ in range(30):
-                assert httpx.post(url, content=b"x" * 1000, timeout=60).is_success
-        finally:
-            stop.set()
+            silent.enter_context(connected(port)).sendall(b"POST /read HT")
+        url = f"http://127.0.0.1:{port}/read"
+        assert httpx.post(url, content=b"x" * 1000, timeout=60).is_success

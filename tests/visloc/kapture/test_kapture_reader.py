@@ -503,7 +503,7 @@ def test_a_sensor_that_comes_twice_into_a_rig_is_refused(tmp_path: Path) -> None
 
 
 def test_ten_thousand_posed_images_are_read(tmp_path: Path) -> None:
-    count = 10_000  # with time that grows as its square, this would be the slowest of all tests
+    count = 10_000
     write(
         tmp_path,
         {

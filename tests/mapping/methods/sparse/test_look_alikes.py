@@ -105,15 +105,19 @@ def test_a_pair_is_believed_when_third_photos_link_the_same_keypoints() -> None:
     assert another not in without_look_alikes(photos, [*pairs.values(), another])
 
 
-def test_a_pair_of_two_places_that_lacks_nothing_is_left_out() -> None:
-    two, one = (
-        {(p.first, p.second): p for p in matches_of(make_hallways(share), share)}
-        for share in (0.08, 1.0)
-    )
+@pytest.mark.parametrize("rows", [(2, 13), (5, 10)])
+def test_a_pair_that_lacks_nothing_is_not_believed_when_those_beside_it_fail(
+    rows: tuple[int, int],
+) -> None:
     photos = make_hallways(1.0)
-    some = {rows: one[rows] for rows in ((2, 13), (2, 12), (3, 13))}
-    assert some[2, 13] in without_look_alikes(photos, [*one.values()])
-    assert some[2, 13] not in without_look_alikes(photos, [*(two | some).values()])
+    full, few = (
+        {(pair.first, pair.second): pair for pair in matches_of(photos, share)}
+        for share in (1.0, 0.08)
+    )
+    within = [pair for (a, b), pair in full.items() if place_of(a) == place_of(b)]
+    assert full[rows] in without_look_alikes(photos, [*within, full[rows]])
+    assert full[rows] in without_look_alikes(photos, [*full.values()])
+    assert full[rows] not in without_look_alikes(photos, [*(few | {rows: full[rows]}).values()])
 
 
 def test_two_photos_alone_are_believed() -> None:
