@@ -189,6 +189,9 @@ class Catalog:
             Conflict: ``map.version_in_use``, ``map.in_set``.
         """
         ref = f"{map_id}@{version}"
+        with suppress(VislocError):  # noted in not_loaded
+            # A request that asked before the last change may have set what is served back.
+            await self._resolve(map_id)
         # If the current version cannot be opened, the one that answers instead counts as current.
         others = set(await asyncio.to_thread(self._store.versions, map_id)) - {version}
         if others and self._is_served(ref):
