@@ -190,7 +190,7 @@ class Catalog:
         """
         ref = f"{map_id}@{version}"
         with suppress(VislocError):  # noted in not_loaded
-            # A request that asked before the last change may have set what is served back.
+            # A request that began before the last change may have brought the older version back.
             await self._resolve(map_id)
         # If the current version cannot be opened, the one that answers instead counts as current.
         others = set(await asyncio.to_thread(self._store.versions, map_id)) - {version}
