@@ -37,6 +37,7 @@ from mapping.methods.known_model import landmarks_from_reconstruction
 from mapping.methods.retrieval_only import RETRIEVAL_ONLY, no_landmarks
 from mapping.methods.rgbd import landmarks_from_depth
 from mapping.methods.sfm import landmarks_from_matches
+from mapping.own_test.given_poses import doubts_about_given
 from mapping.own_test.publishing import Examine, write_content
 from mapping.pairing import write_pairs
 from mapping.progress import Progress, one_step
@@ -57,7 +58,7 @@ from mapping.stages.resolution import at_one_resolution
 from mapping.stages.work_folder import WorkFolder, exclusive
 from visloc.archive import GlobalFeatures, Map, MapStore
 from visloc.archive.schema import Doubt
-from visloc.errors import refuse
+from visloc.errors import VislocError, refuse
 from visloc.features import check_local_features
 from visloc.features.backends.choice import choose_inference
 from visloc.features.local.readymade import is_ready_made
@@ -198,7 +199,14 @@ class _Job:
             ready_made[name] if name in ready_made else describe_photos(context, photos, name)
             for name in settings.global_features
         ]
-        pieces = self._landmarks(photos, global_features)
+        given = self._doubts_about_given(photos, global_features)
+        try:
+            pieces = self._landmarks(photos, global_features)
+        except VislocError as error:  # wrong poses and depth make landmarks impossible, too
+            for doubt in given:
+                error.add_note(doubt.message)
+            raise
+        pieces = tuple(replace(made, doubts=(*given, *made.doubts)) for made in pieces)
         incoming = self.scratch / "incoming"
         shutil.rmtree(incoming, ignore_errors=True)  # of a build that was killed here
         try:
@@ -221,6 +229,14 @@ class _Job:
             depth_sensor=settings.depth_sensor,
             progress=partial(self.context.progress, "photos"),
         )
+
+    def _doubts_about_given(
+        self, photos: Sequence[MappingPhoto], global_features: Sequence[GlobalFeatures]
+    ) -> tuple[Doubt, ...]:
+        if self.settings.sfm.estimate_poses:
+            return ()
+        depth_scale = self.settings.depth.depth_scale if self.settings.method == "rgbd" else None
+        return doubts_about_given(self.context, self.dataset, photos, global_features, depth_scale)
 
     def _landmarks(
         self, photos: Sequence[MappingPhoto], global_features: Sequence[GlobalFeatures]

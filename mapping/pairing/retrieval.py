@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,11 +42,21 @@ def _ranked_blocks(tables: list[NDArray[np.float32]], top_k: int) -> Iterator[Ca
     num_photos = len(tables[0])
     step = max(1, _BLOCK_SIZE // max(num_photos, 1))
     for start in range(0, num_photos, step):
-        photos = np.arange(start, min(start + step, num_photos))
-        cosines = np.stack([(rows[photos] @ rows.T).ravel() for rows in tables])
-        # Unit vectors in float32 can give 1 + 1e-7.
-        cosines = np.clip(cosines.astype(np.float64), -1.0, 1.0)
-        scores = gharm(cosines, equal_weights(len(tables)), DEFAULT_FUSION_PARAMETER)
-        scores = scores.reshape(len(photos), -1)
-        scores[np.arange(len(photos)), photos] = -np.inf  # a photo is no pair with itself
-        yield best_of_rows(photos, scores, top_k)
+        yield most_alike(tables, np.arange(start, min(start + step, num_photos)), top_k)
+
+
+def most_alike(
+    tables: Sequence[NDArray[np.float32]], photos: NDArray[np.int64], top_k: int
+) -> Candidates:
+    """Return the ``top_k`` of all n photos that look most like each of some (b,), by their rows.
+
+    Args:
+        tables: descriptors (n, D) of all photos, unit rows; one table for each kind.
+    """
+    cosines = np.stack([(rows[photos] @ rows.T).ravel() for rows in tables])
+    # Unit vectors in float32 can give 1 + 1e-7.
+    cosines = np.clip(cosines.astype(np.float64), -1.0, 1.0)
+    scores = gharm(cosines, equal_weights(len(tables)), DEFAULT_FUSION_PARAMETER)
+    scores = scores.reshape(len(photos), -1)
+    scores[np.arange(len(photos)), photos] = -np.inf  # a photo is no pair with itself
+    return best_of_rows(photos, scores, top_k)

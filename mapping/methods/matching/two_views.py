@@ -47,6 +47,34 @@ def fits_two_views(
         among: (n,) matches that the relative pose is estimated from; all by default. The others may
             fit it all the same.
     """
+    return _searched(cameras, pixels_a, pixels_b, max_error_px, calibrated, among)[0]
+
+
+def relative_pose(
+    cameras: tuple[Camera, Camera],
+    pixels_a: NDArray[np.floating],
+    pixels_b: NDArray[np.floating],
+    max_error_px: float,
+) -> tuple[Pose, NDArray[np.bool_]] | None:
+    """Return ``b_from_a`` of two calibrated photos, one unit apart, and which matches (n,) fit it.
+
+    None when no more matches fit it than chance explains; arguments as of ``fits_two_views``.
+    """
+    fits, found = _searched(cameras, pixels_a, pixels_b, max_error_px, True, None)
+    if found is None or found.pose is None:
+        return None
+    way = np.asarray(found.pose.t)
+    return Pose(np.asarray(found.pose.R), way / np.linalg.norm(way)), fits
+
+
+def _searched(
+    cameras: tuple[Camera, Camera],
+    pixels_a: NDArray[np.floating],
+    pixels_b: NDArray[np.floating],
+    max_error_px: float,
+    calibrated: bool,
+    among: NDArray[np.bool_] | None,
+) -> tuple[NDArray[np.bool_], _TwoViews | None]:
     fits = np.zeros(len(pixels_a), dtype=bool)
     if calibrated:
         # PoseLib does not know all camera models.
@@ -60,28 +88,28 @@ def fits_two_views(
     finite = np.isfinite(np.concatenate(seen, axis=1)).all(axis=1)
     usable = np.flatnonzero(finite if among is None else finite & among)
     if len(usable) < _FEWEST:
-        return fits
+        return fits, None
     a, b = (points[usable] for points in seen)
     focal_px = focal if calibrated else None
-    fundamental, found = _estimated_by_some(a, b, focal_px, max_error_px)
+    two_views, found = _estimated_by_some(a, b, focal_px, max_error_px)
     if found.sum() < _FEWEST:
-        return fits
+        return fits, None
     share = max(_share_near_a_line(camera, max_error_px) for camera in cameras)
     chance = log10_chance(len(usable), int(found.sum()), share, calibrated=calibrated)
     if chance > MAX_LOG10_CHANCE:
-        return fits
+        return fits, None
     fits[usable[found]] = True
     if among is not None:
         others = np.flatnonzero(finite & ~among)
-        errors = _sampson_errors(fundamental, *(points[others] for points in seen))
+        errors = _sampson_errors(two_views.fundamental, *(points[others] for points in seen))
         fits[others[errors <= max_error_px]] = True
-    return fits
+    return fits, two_views
 
 
 def _estimated_by_some(
     a: NDArray[np.float64], b: NDArray[np.float64], focal_px: float | None, max_error_px: float
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return a fundamental matrix of matched pixels (n, 2), and which of them (n,) fit it.
+) -> tuple[_TwoViews, NDArray[np.bool_]]:
+    """Return the geometry of matched pixels (n, 2), and which of them (n,) fit it.
 
     A part of many matches finds it in a third of the time, and all refine it. Where few of the part
     fit, all of them are searched: a weak pair needs each.
@@ -91,9 +119,8 @@ def _estimated_by_some(
         found, inliers = _estimated(a[some], b[some], focal_px, max_error_px)
         if inliers.mean() >= _CLEAR:
             refined = _refined(found, a, b, focal_px, max_error_px)
-            return refined.fundamental, refined.fits(a, b, max_error_px)
-    found, inliers = _estimated(a, b, focal_px, max_error_px)
-    return found.fundamental, inliers
+            return refined, refined.fits(a, b, max_error_px)
+    return _estimated(a, b, focal_px, max_error_px)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
