@@ -322,8 +322,9 @@ def _factor(ways: NDArray[np.float64], given: NDArray[np.float64]) -> tuple[floa
     slope = float((given / ways)[order][np.searchsorted(weights, weights[-1] / 2)])
     if slope <= 0:
         return math.inf, math.inf
+    # Of a normal distribution: the standard deviation, and how much wider a median scatters.
     deviation = 1.4826 * float(np.median(np.abs(given - slope * ways)))
-    return 1 / slope, deviation / (slope * math.sqrt(float(ways @ ways)))
+    return 1 / slope, 1.2533 * deviation / (slope * math.sqrt(float(ways @ ways)))
 
 
 def _is_along_ray(
