@@ -128,7 +128,7 @@ def _check_global_features(settings: BuildSettings) -> None:
 def _check_lengths(settings: BuildSettings) -> None:
     for name in ("voxel_size", "depth_scale"):
         value = getattr(settings.depth, name)
-        if not (math.isfinite(value) and value > 0):
+        if value is not None and not (math.isfinite(value) and value > 0):
             raise refuse(f"build.{name}", field=f"--{name.replace('_', '-')}", got=value)
     if settings.gravity is not None:
         length = math.hypot(*settings.gravity)

@@ -7,7 +7,9 @@ of them.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import math
+from collections import deque
+from collections.abc import Iterable, MutableSequence, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Annotated
 
@@ -31,7 +33,14 @@ from visloc.kapture import Dataset
 from visloc.pose.colmap import normalized_rays, project
 
 # Raised when the code of the stage changes what comes out.
-_LIFTED_REVISION = 2
+_LIFTED_REVISION = 3
+
+# Edge of a voxel over the median depth of the keypoints, before it is rounded: two and a half
+# pixels of a picture whose focal length is 500.
+_VOXEL_OF_DEPTH = 1 / 200
+# Further away than this, over the median depth, a point moves by less than half such a pixel while
+# the camera moves by the median depth. It cannot tell positions, and is mostly a code for "none".
+_FARTHEST_OF_DEPTH = 1000.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,12 +63,14 @@ class DepthSettings:
     """Settings for landmarks from depth."""
 
     voxel_size: Annotated[
-        float,
+        float | None,
         typer.Option(
-            help="Points within one cell of this edge become one landmark, metres.",
+            help="Points within one cell of this edge become one landmark, metres. Default: 1/200 "
+            "of the median depth of the keypoints, rounded to 1, 2 or 5 times a power of ten.",
+            show_default=False,
             rich_help_panel=RGBD_PANEL,
         ),
-    ] = 0.01
+    ] = None
     depth_scale: DepthScaleOption = 0.001
 
 
@@ -82,26 +93,31 @@ def landmarks_from_depth(
 
     Raises:
         DatasetError: what ``lift_keypoints`` raises.
-        InvalidInput: what ``merge_landmarks`` raises.
+        InvalidInput: what ``leave_out_far`` and ``merge_landmarks`` raise.
     """
     work = context.work
     task = _LiftTask(work, dataset.without_records(), context.features, settings.depth_scale)
     context.run("depth", task.lift, photos)
     with one_step(context.progress, "landmarks"):
-        lifted = (LiftedKeypoints(**work.read(task.key(photo))) for photo in photos)
+        lifted = deque(LiftedKeypoints(**work.read(task.key(photo))) for photo in photos)
         if world_from_dataset is not None:
             move = world_from_dataset
-            lifted = (replace(one, points=move.apply(one.points)) for one in lifted)
+            lifted = deque(replace(one, points=move.apply(one.points)) for one in lifted)
             photos = [replace(photo, cam_from_world=move.move(photo.pose)) for photo in photos]
-        landmarks, rows = merge_landmarks(photos, lifted, settings.voxel_size)
+        depth, notes = leave_out_far(photos, lifted)
+        voxel_size = settings.voxel_size or _rounded(depth * _VOXEL_OF_DEPTH)
+        # Handed over one by one, so that memory holds few of them twice.
+        handed = (lifted.popleft() for _ in photos)
+        landmarks, rows = merge_landmarks(photos, handed, voxel_size)
     return MadeLandmarks(
         photos=np.arange(len(photos)),
         views=tuple(View(photo.camera, photo.pose) for photo in photos),
         landmarks=landmarks,
         rows=tuple(rows),
-        settings=asdict(settings),
+        settings=asdict(replace(settings, voxel_size=voxel_size)),
         metric=metric,
         anchor=Anchor(kind="dataset", images=len(photos)),
+        notes=notes,
     )
 
 
@@ -168,6 +184,45 @@ def lift_keypoints(
     return LiftedKeypoints(rows, keypoints[rows], points)
 
 
+def leave_out_far(
+    photos: Sequence[MappingPhoto], lifted: MutableSequence[LiftedKeypoints]
+) -> tuple[float, tuple[str, ...]]:
+    """Leave out keypoints that are too far away to be true, in place.
+
+    Returns:
+        The median depth of all in the unit of the photos' poses, and a note on those left out.
+
+    Raises:
+        InvalidInput: ``rgbd.no_landmarks``.
+    """
+    depths = [
+        photo.pose.apply(one.points)[:, 2].astype(np.float32)
+        for photo, one in zip(photos, lifted, strict=True)
+    ]
+    of_all = np.concatenate(depths)
+    if len(of_all) == 0:
+        raise refuse("rgbd.no_landmarks", field="dataset")
+    median = float(np.median(of_all))
+    farthest = _FARTHEST_OF_DEPTH * median
+    num_far = np.count_nonzero(of_all > farthest)
+    if num_far == 0:
+        return median, ()
+    for index, depth in enumerate(depths):
+        near, one = depth <= farthest, lifted[index]
+        lifted[index] = LiftedKeypoints(one.rows[near], one.pixels[near], one.points[near])
+    return median, (
+        f"{num_far} of {len(of_all)} keypoints with a depth were left out: they are more than "
+        f"{_FARTHEST_OF_DEPTH:g} times as far away as the median, {median:.3g}",
+    )
+
+
+def _rounded(length: float) -> float:
+    """Round to 1, 2 or 5 times a power of ten: scenes that differ a little get the same cells."""
+    exponent = math.floor(math.log10(length))
+    steps = [float(f"{step}e{exponent}") for step in (1, 2, 5, 10)]
+    return min(steps, key=lambda step: abs(math.log(step / length)))
+
+
 def merge_landmarks(
     photos: Sequence[MappingPhoto], lifted: Iterable[LiftedKeypoints], voxel_size: float
 ) -> tuple[Landmarks, list[NDArray[np.int64]]]:
@@ -185,7 +240,7 @@ def merge_landmarks(
         The landmarks, and for each photo the rows of its features that observe them.
 
     Raises:
-        InvalidInput: ``rgbd.no_landmarks`` or ``rgbd.voxel_size``.
+        InvalidInput: ``rgbd.voxel_size``.
     """
     points_of, pixels_of, rows_of = zip(
         *((one.points, one.pixels, one.rows) for one in lifted), strict=True
@@ -198,8 +253,6 @@ def merge_landmarks(
     del pixels_of
     rows = np.concatenate(rows_of)
     del rows_of
-    if len(points) == 0:
-        raise refuse("rgbd.no_landmarks", field="dataset")
     # Voxels are counted from near the photos, to keep precision far from the world's origin.
     origin = np.round(np.mean([photo.pose.center for photo in photos], axis=0))
     points -= origin

@@ -25,8 +25,9 @@ from visloc.pose.colmap import normalized_rays, project
 DEFAULT_DEPTH_SCALE = 0.001  # metres per unit of a 16-bit PNG: recorders write millimetres
 MAX_DEPTH_PIXELS = 16_000_000
 
-# Published float maps still hold the recorder's code for "none", 65535 mm, as a distance.
-_NO_DEPTH_FROM_M = 65.5
+_NO_DEPTH = 65535  # the code of 16-bit recorders for "none"
+# Published float maps still hold that code as a distance; half a millimetre is for its rounding.
+_NO_DEPTH_M, _ROUNDED_BY_M = 65.535, 0.0005
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_HEADER_BYTES = 33
 _PNG_GREY = 0
@@ -170,8 +171,8 @@ def photo_depth(
 def read_depth(path: Path, camera: Camera, depth_scale: float) -> NDArray[np.float32]:
     """Read a depth map: raw little-endian float32 metres, or a 16-bit grey PNG.
 
-    The content decides, not the name. Invalid values are 0, negative and non-finite ones; in a raw
-    map also 65.5 m and more, in a PNG 65535.
+    The content decides, not the name. Invalid values are 0, negative and non-finite ones; in a PNG
+    also 65535, in a raw map 65.535. A raw map has no farthest depth.
 
     Args:
         camera: the depth sensor's, for the size; a raw map has no header.
@@ -198,11 +199,12 @@ def read_depth(path: Path, camera: Camera, depth_scale: float) -> NDArray[np.flo
             _check_png_header(path, header, camera)
             units = _decode_png(path)
             depth = units.astype(np.float32) * np.float32(depth_scale)
-            invalid = (units == 0) | (units == 65535)
+            invalid = (units == 0) | (units == _NO_DEPTH)
         else:
             depth = _read_raw(path, camera)
             with np.errstate(invalid="ignore"):  # comparing a signalling NaN
-                invalid = ~((depth > 0) & (depth < _NO_DEPTH_FROM_M))
+                is_code = np.abs(depth - np.float32(_NO_DEPTH_M)) < _ROUNDED_BY_M
+                invalid = ~((depth > 0) & (depth < np.inf)) | is_code
     except OSError as error:
         raise refuse("depth.missing", field=str(path), got=error.strerror) from error
     depth[invalid] = np.nan

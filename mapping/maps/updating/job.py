@@ -322,19 +322,22 @@ class _Job:
                 self.context, dataset, photos, described, SfmSettings(), metric=content.metric
             )
             return made, None
-        of_map = content.settings.get("voxel_size")  # of maps by depth
-        usual = DepthSettings().voxel_size * map_from_dataset.scale
-        voxel_size = float(of_map) if isinstance(of_map, int | float) else usual
+        of_map = content.settings.get("voxel_size")  # only maps by depth have one
         made = landmarks_from_depth(
             self.context,
             self.dataset,
             capture.photos,
-            DepthSettings(voxel_size, self.settings.depth_scale),
+            DepthSettings(
+                float(of_map) if isinstance(of_map, int | float) else None,
+                self.settings.depth_scale,
+            ),
             metric=content.metric,
             world_from_dataset=map_from_dataset,
         )
         centers = np.array([view.cam_from_world.center for view in made.views])
         corner = np.round(centers.mean(axis=0))  # like merging
+        voxel_size = made.settings["voxel_size"]
+        assert isinstance(voxel_size, float)
         return made, landmarks_in_same_voxel(content.landmarks, made.landmarks, corner, voxel_size)
 
     def _record(self, placement: Placement, before: MapContent, after: MapContent) -> UpdateRecord:

@@ -124,7 +124,7 @@ def refuse_strange_settings(opened: Map) -> None:
         Conflict: ``update.settings``.
     """
     settings = opened.manifest.method.settings
-    voxel_size = settings.get("voxel_size", DepthSettings().voxel_size)
+    voxel_size = settings.get("voxel_size", 1.0)  # only maps by depth have one
     is_length = (
         isinstance(voxel_size, int | float)
         and not isinstance(voxel_size, bool)
