@@ -511,6 +511,7 @@ def run_build(dataset: Path, maps_dir: Path, trouble: str) -> subprocess.Complet
     )
 
 
+@pytest.mark.slow
 def test_killed_in_any_stage_the_same_command_resumes_and_makes_the_same_map(
     sample: Path, maps_dir: Path, tmp_path: Path
 ) -> None:
@@ -564,6 +565,7 @@ def test_a_first_build_killed_while_it_publishes_needs_no_force(
     assert built.manifest.version in MapStore(tmp_path).versions("room")
 
 
+@pytest.mark.slow
 def test_a_file_that_cannot_be_written_whole_ends_the_command_with_one_line(
     sample: Path, maps_dir: Path
 ) -> None:
@@ -577,6 +579,7 @@ def test_a_file_that_cannot_be_written_whole_ends_the_command_with_one_line(
     assert MapStore(maps_dir).open("room").manifest == before
 
 
+@pytest.mark.slow
 def test_with_workers_the_main_process_loads_no_torch(sample: Path, tmp_path: Path) -> None:
     """It costs the main process two seconds and a quarter of a gigabyte."""
     program = (

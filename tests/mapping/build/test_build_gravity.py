@@ -42,6 +42,7 @@ def with_fixes(walk_copy: Path, rewrite: Callable[..., None]) -> Path:
     return walk_copy
 
 
+@pytest.mark.slow
 def test_a_map_anchored_on_earth_knows_what_is_down(
     with_fixes: Path, tmp_path: Path, build_walk: Build
 ) -> None:
@@ -60,6 +61,7 @@ def test_a_gravity_that_contradicts_a_geodetic_world_is_refused_before_the_work(
     assert not any(path.is_file() for path in (tmp_path / "maps" / ".work" / "walk").rglob("*"))
 
 
+@pytest.mark.slow
 def test_in_an_arbitrary_frame_gravity_is_left_out_with_a_note(
     walk_copy: Path, tmp_path: Path, build_walk: Build, rewrite: Callable[..., None]
 ) -> None:

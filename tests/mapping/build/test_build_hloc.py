@@ -133,6 +133,7 @@ def poses(opened: Map, walk: Path, features_dir: Path) -> list[tuple[Pose, Pose]
     return results
 
 
+@pytest.mark.slow
 def test_hlocs_files_become_the_map_and_the_poses_of_the_same_features(
     hloc: Hloc, walk: Path, tmp_path: Path, build_walk: Build
 ) -> None:
@@ -193,6 +194,7 @@ def test_matches_need_the_keypoints_that_they_are_of(
     assert caught.value.code == "sfm.matches"
 
 
+@pytest.mark.slow
 def test_landmarks_of_matches_keep_their_keypoints_where_something_is_fixed_to_the_picture(
     walk: Path, tmp_path: Path, build_walk: Build
 ) -> None:

@@ -143,6 +143,7 @@ def test_depth_and_features_make_a_map_without_photos(
     assert np.array_equal(built.landmarks, rgbd_walk.landmarks)
 
 
+@pytest.mark.slow
 def test_features_can_lie_elsewhere(
     described_copy: Path, tmp_path: Path, build_walk: Build
 ) -> None:

@@ -83,6 +83,7 @@ def test_every_pairing_makes_a_map_that_localizes(
     assert (num_pairs == 16 * 15 / 2) == (names == ("exhaustive",))
 
 
+@pytest.mark.slow
 def test_the_pairs_in_a_map_make_the_same_map_again(
     walk: Path, tmp_path: Path, build_walk: Build
 ) -> None:
@@ -149,6 +150,7 @@ def centers_of(dataset: Path) -> dict[str, NDArray[np.float64]]:
     return {r.path: pose.center for r in read.images if (pose := read.pose(r)) is not None}
 
 
+@pytest.mark.slow
 def test_without_any_position_the_world_is_said_to_be_arbitrary(
     walk_copy: Path, tmp_path: Path, build_walk: Build, rewrite: Rewrite
 ) -> None:
@@ -173,6 +175,7 @@ def test_without_any_position_the_world_is_said_to_be_arbitrary(
     assert {camera.source for camera in cameras_of(built).values()} == {"estimated"}
 
 
+@pytest.mark.slow
 def test_gnss_says_where_the_map_lies_and_one_wrong_fix_does_no_harm(
     walk: Path, walk_copy: Path, tmp_path: Path, build_walk: Build, rewrite: Rewrite
 ) -> None:
@@ -207,6 +210,7 @@ def test_gnss_says_where_the_map_lies_and_one_wrong_fix_does_no_harm(
     assert np.linalg.norm(found - expected, axis=1).max() < 0.15
 
 
+@pytest.mark.slow
 def test_poses_of_some_photos_anchor_all_of_them(
     walk: Path,
     walk_copy: Path,

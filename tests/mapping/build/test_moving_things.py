@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from benchmarks.moving import NUM_PHOTOS, SIZE, built, write_photos
 from samples.trajectories import mapping_trajectory, stereo_rig
 from visloc.archive import MapStore
 
 
+@pytest.mark.slow
 def test_a_map_that_something_moving_bent_is_not_put_into_use(tmp_path: Path) -> None:
     mounted = stereo_rig(*SIZE)["left"].cam_from_rig
     true = [mounted @ pose for pose in mapping_trajectory(NUM_PHOTOS)]

@@ -101,6 +101,7 @@ def built(rooms: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) ->
     return folder / "maps"
 
 
+@pytest.mark.slow
 def test_each_room_is_a_map_of_its_own(built: Path) -> None:
     store = MapStore(built)
     assert store.ids() == ["home", "home-2"]
@@ -115,6 +116,7 @@ def test_each_room_is_a_map_of_its_own(built: Path) -> None:
         assert opened.manifest.world.anchor.kind == "none"
 
 
+@pytest.mark.slow
 def test_the_largest_names_the_other(built: Path) -> None:
     store = MapStore(built)
     largest, other = store.open("home"), store.open("home-2")
@@ -124,6 +126,7 @@ def test_the_largest_names_the_other(built: Path) -> None:
     assert note_of_piece("home-2", "home") in other.manifest.notes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [0, 1])
 def test_queries_of_each_room_are_localized_by_its_map(
     built: Path, rooms: tuple[Path, Path], number: int
@@ -188,11 +191,8 @@ def written(sample_map: Map, tmp_path: Path) -> Written:
 
 
 @pytest.fixture(scope="module")
-def sample_map(sample: Path, tmp_path_factory: pytest.TempPathFactory) -> Map:
-    settings = BuildSettings(
-        sample / "mapping", "room", tmp_path_factory.mktemp("maps"), local_features="sift"
-    )
-    return open_map(build_map(settings, lambda *_: None))
+def sample_map(build_sample: Callable[..., Map]) -> Map:
+    return build_sample()
 
 
 @pytest.fixture

@@ -211,6 +211,7 @@ def _part(dataset: Path, folder: Path, rows: Sequence[int]) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_photos_join_one_by_one_where_they_were_taken(
     walk: Path, build_walk: Callable[..., Map], tmp_path: Path
 ) -> None:
@@ -239,6 +240,7 @@ def test_photos_join_one_by_one_where_they_were_taken(
     assert [(one["method"], one["photos"]) for one in updates] == [("retrieval-only", 2)] * 2  # type: ignore[union-attr,index,call-overload]
 
 
+@pytest.mark.slow
 def test_two_maps_without_landmarks_merge(
     walk: Path, build_walk: Callable[..., Map], tmp_path: Path
 ) -> None:
