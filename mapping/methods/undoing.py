@@ -14,6 +14,7 @@ from mapping.methods.matching.stages import Matches
 from mapping.methods.sparse.colmap_scene import Rigs
 from mapping.methods.sparse.contradictions import ModelPhoto, Places, find_places
 from mapping.methods.sparse.model import MapperConfig, SfmPhoto, SparseModel
+from mapping.methods.sparse.pair_agreement import contradicted_pairs
 from mapping.methods.sparse.triangulation import reconstruct
 from mapping.progress import ItemProgress, Progress, part_of
 from mapping.stages.landmarks import rows_by_value
@@ -41,19 +42,65 @@ def reconstruct_places(
     Args:
         describe: returns the descriptors (k, D) of a photo's keypoints, all with one scale.
     """
-    model = reconstruct(photos, rigs, matches, config, refine, work, progress)
+    how = config, refine, work, progress
+    told = partial(progress, PLACES)
+    try:
+        model = reconstruct(photos, rigs, matches, *how)
+    except InvalidInput:
+        whole = _of_all_pairs(photos, describe, rigs, matches, *how)
+        if whole is None:
+            raise
+        return whole
+    if None in model.views:
+        whole = _of_all_pairs(photos, describe, rigs, matches, *how)
+        if whole is not None and whole.views.count(None) < model.views.count(None):
+            return whole
     undone = 0
     for _ in range(_MOST_MODELS - 1):
-        kept = _without_two_places(photos, describe, matches, model, partial(progress, PLACES))
+        kept = _without_two_places(photos, describe, matches, model, told)
         if len(kept) == len(matches):
             break
         try:
-            model = reconstruct(photos, rigs, kept, config, refine, work, progress)
+            model = reconstruct(photos, rigs, kept, *how)
         except InvalidInput:
             break  # too little is left; the map's own test tells that it shows two places
         undone += len(matches) - len(kept)
         matches = kept
     return replace(model, undone=undone)
+
+
+def _of_all_pairs(
+    photos: Sequence[SfmPhoto],
+    describe: Callable[[int], NDArray[np.int8]],
+    rigs: Rigs,
+    matches: Sequence[Matches],
+    config: MapperConfig,
+    refine: Sequence[str],
+    work: Path,
+    progress: Progress,
+) -> SparseModel | None:
+    """Reconstruct with pairs of photos that may look alike, too; None if that shows two places.
+
+    The filter of look-alike pairs also drops true ones, such as those of a wide photo and of one
+    from nearby. A photo has no place if most of its matches contradict the pose that it gets.
+    """
+    how = config, refine, work, progress
+    try:
+        model = reconstruct(photos, rigs, matches, *how, filtered=False)
+        against, _ = contradicted_pairs(model, photos, matches, config.filter_max_reproj_error)
+        counts = np.zeros((2, len(photos)), np.int64)
+        for row, pairs in enumerate((matches, against)):
+            for pair in pairs:
+                counts[row, [pair.first, pair.second]] += len(pair.rows)
+        astray = set(np.flatnonzero(2 * counts[1] > counts[0]).tolist())
+        if astray:
+            matches = [pair for pair in matches if not {pair.first, pair.second} & astray]
+            model = reconstruct(photos, rigs, matches, *how, filtered=False)
+    except InvalidInput:
+        return None
+    told = partial(progress, PLACES)
+    kept = _without_two_places(photos, describe, matches, model, told)
+    return model if len(kept) == len(matches) else None
 
 
 def _without_two_places(

@@ -100,11 +100,13 @@ def reconstruct(
     refine: Sequence[str],
     work: Path,
     progress: Progress,
+    *,
+    filtered: bool = True,
 ) -> SparseModel:
     """Find poses and points by incremental mapping, in an arbitrary frame and unit.
 
     Known intrinsics stay unless ``refine`` names them, and also if they are in doubt
-    (``SparseModel.doubts``). Pairs that seem to show two places are not used
+    (``SparseModel.doubts``). If ``filtered``, pairs that seem to show two places are not used
     (``mapping.methods.sparse.look_alikes``). Of several models that do not connect, the largest is
     taken.
     The stages of ``progress`` are ``LOOK_ALIKES``, in pairs, ``MAPPING`` as ``largest_model``,
@@ -113,7 +115,8 @@ def reconstruct(
     Raises:
         InvalidInput: ``sfm.no_matches``, ``sfm.no_model``, ``sfm.camera``, ``sfm.no_points``.
     """
-    matches = without_look_alikes(photos, matches, partial(progress, LOOK_ALIKES))
+    if filtered:
+        matches = without_look_alikes(photos, matches, partial(progress, LOOK_ALIKES))
     adjusting = partial(progress, ADJUSTMENT)
     with colmap_database(photos, rigs, thin(photos, matches), work) as (path, scene):
         known = {photo.sensor for photo in photos if photo.camera_known}
