@@ -31,6 +31,7 @@ from visloc.geometry import Pose, rotation_angle
 from visloc.kapture import Dataset
 from visloc.matching.correspondences import mutual_nearest_neighbours
 from visloc.matching.products import round_descriptors
+from visloc.matching.verification import epipolar_errors
 from visloc.pose.colmap import normalized_rays
 from visloc.pose_conventions import READINGS
 
@@ -51,6 +52,9 @@ _NAMED_SHARE, _NAMED_MOST, _NAMED_LESS = 1 / 3, 4.0, 0.4
 # Medians that contradict the poses whatever other reading fits. Noise of 20 cm and one degree gives
 # 2.6 and at most 45 degrees there.
 _ROTATION_DEG, _DIRECTION_DEG = 5.0, 75.0
+# Few matches of a wall fit many relative poses. They contradict poses only if less than this part
+# of them fits, to this share of the longer side (``mapping.methods.sparse.pair_agreement``).
+_LEAST_FITTING, _ABOUT = 0.4, 0.01
 # Depth that fits the poses to less than this share is right. Kinect's is 1 to 2 % off.
 _DEPTH_OFF = 0.05
 _STANDARD_ERRORS = 4.0
@@ -67,6 +71,8 @@ class _Pair:
         parallax_deg: median angle between matched rays.
         pixels: (k, 2) of matches in the first photo.
         distances: (k,) their depth in the first photo, in distances between the cameras.
+        rays: (n, 3) of all matches that fit, in the first camera and in the second.
+        about: how far rays may miss each other at depth 1 without contradicting poses.
     """
 
     first: int
@@ -75,6 +81,8 @@ class _Pair:
     parallax_deg: float
     pixels: NDArray[np.float32]
     distances: NDArray[np.float64]
+    rays: tuple[NDArray[np.float64], NDArray[np.float64]]
+    about: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,7 +181,11 @@ def _measured(
     clear = angles > _LEAST_PARALLAX_DEG
     distances = _distances(turned[clear], rays_b[clear], b_from_a.translation)
     pixels_a = pixels[0][fits][clear]
-    return _Pair(first, second, b_from_a, float(np.median(angles)), pixels_a, distances)
+    longest = max(a.camera.width, a.camera.height, b.camera.width, b.camera.height)
+    about = _ABOUT * longest / min(a.camera.focal_length, b.camera.focal_length)
+    parallax_deg = float(np.median(angles))
+    rays = rays_a, rays_b
+    return _Pair(first, second, b_from_a, parallax_deg, pixels_a, distances, rays, about)
 
 
 def _distances(
@@ -199,17 +211,20 @@ def _doubt_about_poses(
     }
     name = min(left, key=lambda each: left[each])
     is_named = left[name] <= min(_NAMED_SHARE * total, _NAMED_MOST, total - _NAMED_LESS)
-    if not is_named and rotation_deg <= _ROTATION_DEG and direction_deg <= _DIRECTION_DEG:
+    if not is_named and (
+        (rotation_deg <= _ROTATION_DEG and direction_deg <= _DIRECTION_DEG)
+        or np.median([_fitting(given, pair) for pair in pairs]) >= _LEAST_FITTING
+    ):
         return None
     advice = (
-        f"They look like {name}"
+        f"They look like {name}."
         if is_named
-        else "No usual convention explains them: do they belong to these photos?"
+        else "No usual convention explains them. Do they belong to these photos?"
     )
     message = (
         f"the matches of {len(pairs)} pairs of photos contradict the given poses, by "
         f"{rotation_deg:.1f} degrees of rotation and {direction_deg:.0f} of direction in "
-        f"the median. {advice}. Poses must be cam_from_world: world to camera, x right, y down, "
+        f"the median. {advice} Poses must be cam_from_world: world to camera, x right, y down, "
         "z forward (docs/conventions.md)"
     )
     errors = np.array([_errors(given, pair)[0] for pair in pairs])
@@ -251,6 +266,12 @@ def _disagreement(poses: Sequence[Pose], pairs: Sequence[_Pair]) -> tuple[float,
         return float(np.median(rotations)), 0.0
     far = clear & (lengths >= np.median(lengths[clear]))
     return float(np.median(rotations)), float(np.median(directions[far]))
+
+
+def _fitting(poses: Sequence[Pose], pair: _Pair) -> float:
+    """Return the share of a pair's matches that fit poses."""
+    b_from_a = poses[pair.second] @ poses[pair.first].inverse()
+    return float(np.mean(epipolar_errors(*pair.rays, b_from_a) <= pair.about))
 
 
 def _errors(poses: Sequence[Pose], pair: _Pair) -> tuple[float, float, float]:

@@ -53,13 +53,18 @@ def photo(row: int, pose: Pose) -> MappingPhoto:
 
 def pairs_of(poses: list[Pose]) -> list[_Pair]:
     """What exact matches of photos one to four steps apart tell."""
-    pairs = []
+    pairs, random = [], np.random.default_rng(0)
     for first in range(len(poses)):
         for second in range(first + 1, min(first + 5, len(poses))):
             b_from_a = poses[second] @ poses[first].inverse()
             unit = b_from_a.translation / np.linalg.norm(b_from_a.translation)
             none = np.empty((0, 2), np.float32), np.empty(0)
-            pairs.append(_Pair(first, second, Pose(b_from_a.rotation, unit), 10.0, *none))
+            points = random.uniform((-1, -1, 2), (1, 1, 6), (60, 3))
+            there = b_from_a.apply(points)
+            rays = points / points[:, 2:], there / there[:, 2:]
+            pairs.append(
+                _Pair(first, second, Pose(b_from_a.rotation, unit), 10.0, *none, rays, 0.01)
+            )
     return pairs
 
 
