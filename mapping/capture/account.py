@@ -12,6 +12,7 @@ from mapping.capture.frames import FilmedVideo
 from mapping.capture.job import Captured
 from mapping.capture.trying import LOST_SIZE, Trials
 from mapping.report.cameras import disputed_focal_lengths
+from mapping.stages.photos import some
 from visloc.archive import Map
 
 USED, NOT_CONNECTED, BLURRED = "used", "not connected", "too blurred"
@@ -117,6 +118,7 @@ def verdict(trials: Trials, captured: Captured, opened: Map) -> str:
     )
     lines = [
         f"The map is {grade}: {len(opened.images)} of {len(captured.photos)} photos are in it.",
+        *_missing(captured, opened),
         f"As a test, {_each_of(len(trials.right), len(opened.images))} was hidden from the map "
         f"together with its neighbours, and then looked for: {int(trials.right.sum())} of "
         f"{len(trials.right)} were found where the map has them. (This does not measure whether "
@@ -126,6 +128,12 @@ def verdict(trials: Trials, captured: Captured, opened: Map) -> str:
         *(f"What speaks against it: {doubt.message}." for doubt in doubts),
     ]
     return " ".join(lines)
+
+
+def _missing(captured: Captured, opened: Map) -> list[str]:
+    there = {image.name for image in opened.images}
+    names = [name for name in captured.photos if name not in there]
+    return [f"Not in it: {some(names)}."] if names else []
 
 
 def _each_of(tested: int, photos: int) -> str:
@@ -149,7 +157,7 @@ def film_again(trials: Trials, stretches: Sequence[Stretch], opened: Map) -> lis
     In a good map, most single photos that are not found are the ends of a walk: they tell nothing.
     """
     advice = {
-        NOT_CONNECTED: "nothing links it to the rest; begin and end where the map is good",
+        NOT_CONNECTED: "not linked to the rest for sure; begin and end where the map is good",
         BLURRED: "too blurred; walk slower, or with more light",
     }
     lines = [f"{s.source}, {s.what}: {advice[s.fate]}" for s in stretches if s.fate in advice]

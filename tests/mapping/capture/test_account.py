@@ -100,7 +100,7 @@ def test_what_to_film_again() -> None:
     trials = Trials(np.arange(6), np.array([True, False, False, True, True, False]))
     lines = film_again(trials, fates(captured(), opened), opened)
     assert any("second 6 to 8: too blurred" in line for line in lines)
-    assert any("second 8 to 10: nothing links it" in line for line in lines)
+    assert any("second 8 to 10: not linked to the rest" in line for line in lines)
     assert any("1.jpg to 2.jpg" in line for line in lines)
     assert any(line.startswith("5.jpg: photos there were not found") for line in lines)
 
