@@ -183,9 +183,8 @@ def _doubt(aligned: NDArray[np.float64], known: NDArray[np.float64]) -> str | No
     extents = _extents(aligned)
     num = len(np.unique(known, axis=0))
     rms = math.sqrt(np.sum((aligned - known) ** 2) / num_photos)
-    margin = _margin(rms * rms * num, 3 * num - 7) / math.sqrt(num)
-    scale = margin / float(np.linalg.norm(extents))
-    angle = math.degrees(margin / math.hypot(extents[1], extents[2]))
+    scale = scale_margin(aligned, known)
+    angle = math.degrees(scale * math.hypot(*extents) / math.hypot(extents[1], extents[2]))
     if scale > MAX_SCALE_ERROR or angle > MAX_DIRECTION_ERROR_DEG:
         return (
             f"they are too inexact for their extent: {num} positions, {rms:.2g} from the "
@@ -195,6 +194,22 @@ def _doubt(aligned: NDArray[np.float64], known: NDArray[np.float64]) -> str | No
             f"{MAX_DIRECTION_ERROR_DEG:.0f}"
         )
     return None
+
+
+def scale_margin(aligned: NDArray[np.float64], known: NDArray[np.float64]) -> float:
+    """Half of the 95 % interval, as a part, of the scale that aligned centres (n, 3)."""
+    num = len(np.unique(known, axis=0))
+    squared_misfit = float(np.sum((aligned - known) ** 2)) * num / len(aligned)
+    margin = _margin(squared_misfit, 3 * num - 7) / math.sqrt(num)
+    return margin / math.hypot(*_extents(aligned))
+
+
+def at_own_scale(
+    similarity: Similarity, centers: NDArray[np.float64], known: NDArray[np.float64]
+) -> Similarity:
+    """Return the rigid fit of the centres (n, 3) that a similarity fits to known positions."""
+    rotation = similarity.rotation  # that of the best fit does not depend on the scale
+    return Similarity(1.0, rotation, known.mean(axis=0) - rotation @ centers.mean(axis=0))
 
 
 def _line_doubt(centers: NDArray[np.float64]) -> str | None:

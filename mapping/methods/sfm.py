@@ -14,7 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import JsonValue
 
-from mapping.frames.anchor import align_positions, known_positions
+from mapping.frames.anchor import (
+    MAX_SCALE_ERROR,
+    align_positions,
+    at_own_scale,
+    known_positions,
+    scale_margin,
+)
 from mapping.frames.anchor_error import place_error
 from mapping.methods.matching.stages import (
     Matches,
@@ -54,7 +60,7 @@ from visloc.kapture.matches import open_matches
 # When more of the photos have no place, what is missing may be most of the place.
 _MANY_ABSENT = 0.4
 UNPLACED = "nothing says where the photos were taken: the frame and unit are arbitrary"
-"""The note on a map that has no place in the world."""
+"""The note on a map that has no place in the world, nor rigs that tell its unit."""
 
 
 def landmarks_from_matches(
@@ -102,14 +108,18 @@ def landmarks_from_matches(
         look = _Look(context, photos, rigs, pairs.rows, verification, settings)
         models = look.models(model, *matched)
     notes = (*_notes_on_fixed(photos, fixed), *_notes_on_absent(photos, [one for one, _ in models]))
+    placed = (
+        (_placed_landmarks(dataset, photos, one, settings, metric=metric, notes=notes), doubts)
+        for one, doubts in models
+    )
     return tuple(
         replace(
-            _placed_landmarks(dataset, photos, one, settings, metric=metric, notes=notes),
+            made,
             pairs=(scene, pairs),
-            doubts=doubts,
+            doubts=(*made.doubts, *doubts),
             fixed=context.features.fixed,
         )
-        for one, doubts in models
+        for made, doubts in placed
     )
 
 
@@ -251,14 +261,19 @@ def _placed_landmarks(
     points = model.points
     rig_scale: float | None = 1.0
     anchor = Anchor(kind="dataset", images=len(photos))
+    doubts: tuple[Doubt, ...] = ()
     if settings.estimate_poses:
-        similarity, anchor, on_anchor = _anchored(dataset, photos, model)
+        in_unit_of_rigs = _is_in_unit_of_rigs(dataset, photos, model)
+        similarity, anchor, on_anchor, doubts = _anchored(
+            dataset, photos, model, keep_unit=in_unit_of_rigs
+        )
         notes = (*notes, *on_anchor)
         views = [View(v.camera, similarity.move(v.cam_from_world)) for v in views]
         points = similarity.apply(points)
         # Without rigs in it, the reconstruction had a unit of its own.
         rig_scale = similarity.scale if model.on_rigs else None
-        metric = anchor.kind == "gnss" or (anchor.kind == "positions" and metric)
+        if anchor.kind != "positions" and not in_unit_of_rigs:
+            metric = anchor.kind == "gnss"
     number = np.full(len(photos), -1)
     number[placed] = np.arange(len(placed))
     observations = replace(model.observations, views=number[model.observations.views])
@@ -273,6 +288,7 @@ def _placed_landmarks(
         anchor=anchor,
         rig_scale=rig_scale,
         notes=notes,
+        doubts=doubts,
     )
 
 
@@ -335,14 +351,32 @@ def known_rigs(
     return {rig: members for rig, members in rigs.items() if members}
 
 
-def _anchored(
+def _is_in_unit_of_rigs(
     dataset: Dataset, photos: Sequence[MappingPhoto], model: SparseModel
-) -> tuple[Similarity, Anchor, tuple[str, ...]]:
-    """Return where an estimated model lies according to known positions, and notes."""
-    free = Similarity(1.0, np.eye(3), np.zeros(3)), Anchor(kind="none", images=0)
+) -> bool:
+    """Tell whether rigs held cameras apart from each other at some instant of a model."""
+    rigs = known_rigs(dataset, {photo.record.sensor_id for photo in photos})
+    rig_of = {sensor: rig for rig, members in rigs.items() for sensor in members}
+    centers: dict[tuple[str, int], list[NDArray[np.float64]]] = {}
+    for photo, view in zip(photos, model.views, strict=True):
+        if view is not None and (rig := rig_of.get(photo.record.sensor_id)) is not None:
+            instant = centers.setdefault((rig, photo.record.timestamp), [])
+            instant.append(rigs[rig][photo.record.sensor_id].center)
+    return model.on_rigs and any(np.any(np.ptp(each, axis=0)) for each in centers.values())
+
+
+def _anchored(
+    dataset: Dataset, photos: Sequence[MappingPhoto], model: SparseModel, *, keep_unit: bool
+) -> tuple[Similarity, Anchor, tuple[str, ...], tuple[Doubt, ...]]:
+    """Return where an estimated model lies according to known positions, notes and doubts.
+
+    ``keep_unit``: positions move and turn the model, but its scale stays.
+    """
+    free = Similarity.identity(), Anchor(kind="none", images=0)
+    arbitrary = "the frame is arbitrary" if keep_unit else "the frame and unit are arbitrary"
     known = known_positions(dataset, photos)
     if known is None:
-        return *free, (UNPLACED,)
+        return *free, (f"nothing says where the photos were taken: {arbitrary}",), ()
     placed = np.array([model.views[row] is not None for row in known.photos])
     views = [view for row in known.photos if (view := model.views[row]) is not None]
     centers = np.array([view.cam_from_world.center for view in views]).reshape(-1, 3)
@@ -351,16 +385,37 @@ def _anchored(
     if isinstance(found, str):
         note = (
             f"{len(known.photos)} photos have a known position ({known.anchor.kind}), but {found}: "
-            "the frame and unit are arbitrary"
+            f"{arbitrary}"
         )
-        return *free, (note,)
+        return *free, (note,), ()
     similarity, agrees = found
-    errors = np.linalg.norm(similarity.apply(centers) - positions, axis=1)[agrees]
-    rms = float(np.sqrt(np.mean(errors**2)))
+    centers, positions = centers[agrees], positions[agrees]
+    doubts: tuple[Doubt, ...] = ()
+    if keep_unit:
+        doubts = _doubts_about_unit(similarity, centers, positions)
+        similarity = at_own_scale(similarity, centers, positions)
+    aligned = similarity.apply(centers)
+    rms = float(np.sqrt(np.mean(np.sum((aligned - positions) ** 2, axis=1))))
     anchor = known.anchor.model_copy(update={"images": int(agrees.sum()), "rms": rms})
     if anchor.geodetic is not None:  # then the world's axes are east, north and up of it
-        placed = similarity.apply(centers[agrees])
-        error = place_error(anchor.geodetic, placed, positions[agrees])
+        error = place_error(anchor.geodetic, aligned, positions, fits_scale=not keep_unit)
         geodetic = anchor.geodetic.model_copy(update={"error": error})
         anchor = anchor.model_copy(update={"geodetic": geodetic})
-    return similarity, anchor, ()
+    return similarity, anchor, (), doubts
+
+
+def _doubts_about_unit(
+    similarity: Similarity, centers: NDArray[np.float64], positions: NDArray[np.float64]
+) -> tuple[Doubt, ...]:
+    """Return a doubt where known positions and rigs differ in their unit beyond errors."""
+    scale, margin = similarity.scale, scale_margin(similarity.apply(centers), positions)
+    if abs(scale - 1) <= MAX_SCALE_ERROR + scale * margin:
+        return ()
+    message = (
+        f"rigs and known positions contradict each other: the distances between the cameras of "
+        f"rigs.txt give the map its unit, and by {len(positions)} positions it should be "
+        f"{scale:.4g} times as large (+- {scale * margin:.1g}; within {MAX_SCALE_ERROR:.0%} of 1 "
+        "is expected); correct rigs.txt (unit, distances, directions), the intrinsics or the "
+        "positions, whichever is wrong, and build again"
+    )
+    return (Doubt(kind="unit", message=message),)

@@ -20,7 +20,7 @@ from visloc.archive.schema import Doubt
 from visloc.errors import NotFound, refuse
 
 # Kinds of doubts that no test of the finished map finds again.
-_OF_THE_BUILD = ("depth", "left_out", "matches", "order", "poses", "scale")
+_OF_THE_BUILD = ("depth", "left_out", "matches", "order", "poses", "scale", "unit")
 Examine = Callable[[Map], Sequence[Doubt]]
 """What else speaks against a map, beside its own test."""
 

@@ -286,8 +286,9 @@ class Doubt(Record):
     """A reason why a version was not put into use by itself.
 
     Attributes:
-        kind: ``own_test``, ``left_out``, ``pieces``, ``places`` or ``matches``; of given poses and
-            depth maps ``poses`` or ``depth``; of a capture also ``order``, ``scale`` or ``size``.
+        kind: ``own_test``, ``left_out``, ``pieces``, ``places``, ``matches`` or ``unit``; of given
+            poses and depth maps ``poses`` or ``depth``; of a capture also ``order``, ``scale`` or
+            ``size``.
         message: a sentence for people.
         photos: names of those that it is about, or of the first of them.
     """

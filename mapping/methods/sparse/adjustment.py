@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -112,8 +112,8 @@ def adjusted_robustly(
 
     The mapper adjusts all photos by squared errors. Of the matches that fit the geometry of their
     two photos to a few pixels, one in twenty is wrong; squared, they outweigh the others, and bend
-    a model of few photos by centimetres in a room (``python -m benchmarks.joining small``). Rigs
-    keep their unit: their members do not move in them.
+    a model of few photos by centimetres in a room (``python -m benchmarks.joining small``).
+    Members of rigs do not move in them.
 
     A principal point that is two pixels off bends the paths of cameras too. It is refined last, of
     cameras with many photos: before, it would take up errors of poses. It stays when one moves
@@ -156,6 +156,12 @@ def adjust_growing(
         most *= 2
         solver.gradient_tolerance /= _CLOSER
     _adjust(model, options, constant, progress, poses=True, most=most)
+
+
+def rig_length(rigs: Iterable[pycolmap.Rig]) -> float:
+    """Return the summed distances of cameras from the first of their rigs, 0 without a baseline."""
+    poses = (pose for rig in rigs for pose in rig.non_ref_sensors.values() if pose is not None)
+    return math.fsum(float(np.linalg.norm(pose.translation)) for pose in poses)
 
 
 def adjust_some(model: pycolmap.Reconstruction, image_ids: Collection[int]) -> None:
@@ -246,7 +252,11 @@ def _adjust(
         config.add_image(image_id)
     for camera_id in constant:
         config.set_constant_cam_intrinsics(camera_id)
-    if poses:
+    if poses and rig_length(
+        model.rigs.values()
+    ):  # two fixed frames would contradict the rigs' unit
+        config.set_constant_rig_from_world_pose(min(model.reg_frame_ids()))
+    elif poses:
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     _solve(model, options, config, progress, most)
 

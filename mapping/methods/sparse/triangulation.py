@@ -14,7 +14,12 @@ import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
 import pycolmap
 
 from mapping.methods.matching.stages import Matches, matches_among
-from mapping.methods.sparse.adjustment import adjusted_robustly, error_rises, refine_model
+from mapping.methods.sparse.adjustment import (
+    adjusted_robustly,
+    error_rises,
+    refine_model,
+    rig_length,
+)
 from mapping.methods.sparse.colmap_scene import ColmapScene, Rigs, colmap_database
 from mapping.methods.sparse.incremental import largest_model
 from mapping.methods.sparse.intrinsics import (
@@ -103,7 +108,9 @@ def reconstruct(
     *,
     filtered: bool = True,
 ) -> SparseModel:
-    """Find poses and points by incremental mapping, in an arbitrary frame and unit.
+    """Find poses and points by incremental mapping, in an arbitrary frame.
+
+    The unit is that of the rigs, where they hold cameras apart, else arbitrary.
 
     Known intrinsics stay unless ``refine`` names them, and also if they are in doubt
     (``SparseModel.doubts``). If ``filtered``, pairs that seem to show two places are not used
@@ -144,6 +151,9 @@ def reconstruct(
         result, doubts = solve_with_priors(solve, scene, photos, refined, adjusting, poses=True)
         sure = {scene.camera_ids[sensor] for sensor in refined - doubts.keys()}
         result = adjusted_robustly(result, sure, adjusting)
+        if length := rig_length(scene.rigs):  # the mapper normalizes its model, rigs and all
+            unit = length / rig_length(result.rigs.values())
+            result.transform(pycolmap.Sim3d(unit, pycolmap.Rotation3d(), np.zeros(3)))
         found = scene.read(result, photos, ("poses", "intrinsics"), doubts)
     return _with_all_points(found, photos, rigs, matches, config, work, progress)
 

@@ -15,7 +15,7 @@ from mapping.pairing import PAIRINGS, PairSettings
 from mapping.report.cameras import cameras_of
 from mapping.sample import ANCHOR_ALTITUDE_M, ANCHOR_LATITUDE_DEG, ANCHOR_LONGITUDE_DEG
 from visloc.archive import Map, MapStore
-from visloc.errors import DatasetError, InvalidInput, VislocError
+from visloc.errors import DatasetError, InvalidInput, NotFound, VislocError
 from visloc.evaluation import pose_error
 from visloc.geodesy import enu_from_geodetic, geodetic_from_enu
 from visloc.geometry import Camera, Pose
@@ -242,6 +242,76 @@ def test_poses_of_some_photos_anchor_all_of_them(
     assert errors[:, 0].max() < 0.1
     # So short a walk tells which way the world is turned to 1 or 2 degrees only.
     assert errors[:, 1].max() < 3.0
+
+
+def relative_to_rig(built: Map) -> NDArray[np.float64]:
+    """How far apart the photos of each instant are, as a part of what the map's rig says."""
+    poses = {
+        (record.timestamp, record.camera): Pose.from_quaternion(row[:4], row[4:])
+        for record, row in zip(built.images, built.image_poses, strict=True)
+    }
+    rig = built.rigs["rig"]
+    known = rig["right"] @ rig["left"].inverse()
+    found = [
+        poses[stamp, "right"] @ pose.inverse()
+        for (stamp, sensor), pose in poses.items()
+        if sensor == "left" and (stamp, "right") in poses
+    ]
+    assert len(found) == 8
+    length = np.linalg.norm(known.translation)
+    return np.array([np.linalg.norm(p.translation - known.translation) / length for p in found])
+
+
+def test_a_rig_gives_the_unit_and_positions_the_place(
+    walk_copy: Path, tmp_path: Path, build_walk: Build, rewrite: Rewrite
+) -> None:
+    truth = read_dataset(walk_copy)
+    rewrite(walk_copy, depth_maps=())
+    built = build_walk(walk_copy, tmp_path / "maps", sfm=ESTIMATE)
+    assert built.manifest.world.metric
+    assert built.manifest.world.anchor is not None
+    assert built.manifest.world.anchor.kind == "positions"
+    assert not [doubt for doubt in built.manifest.parts.doubts if doubt.kind == "unit"]
+    assert relative_to_rig(built).max() < 1e-6
+    for sensor, pose in truth.rigs["rig"].items():
+        if sensor in built.rigs["rig"] and pose is not None:
+            np.testing.assert_allclose(built.rigs["rig"][sensor].translation, pose.translation)
+
+
+def test_a_rig_gives_the_unit_where_nothing_gives_the_place(
+    walk_copy: Path, tmp_path: Path, build_walk: Build, rewrite: Rewrite
+) -> None:
+    rewrite(walk_copy, trajectories={}, gnss=(), depth_maps=())
+    built = build_walk(walk_copy, tmp_path / "maps", sfm=ESTIMATE)
+    assert built.manifest.world.metric
+    assert any(note.endswith("the frame is arbitrary") for note in built.manifest.notes)
+    assert relative_to_rig(built).max() < 1e-6
+
+
+def test_a_rig_of_half_its_size_contradicts_the_positions(
+    walk_copy: Path, tmp_path: Path, build_walk: Build, rewrite: Rewrite
+) -> None:
+    truth = read_dataset(walk_copy)
+    poses = {
+        (record.timestamp, record.sensor_id): pose
+        for record in truth.images
+        if (pose := truth.pose(record)) is not None
+    }
+    halved = {
+        sensor: pose and Pose(pose.rotation, pose.translation / 2)
+        for sensor, pose in truth.rigs["rig"].items()
+    }
+    rewrite(walk_copy, rigs={"rig": halved}, trajectories=poses, depth_maps=())
+    with pytest.raises(NotFound, match="no version of the map is current"):
+        build_walk(walk_copy, tmp_path / "maps", sfm=ESTIMATE)
+    store = MapStore(tmp_path / "maps")
+    (version,) = store.versions("walk")
+    built = store.open(f"walk@{version}")
+    (doubt,) = (doubt for doubt in built.manifest.parts.doubts if doubt.kind == "unit")
+    factor = re.search(r"should be ([0-9.]+) times as large", doubt.message)
+    assert factor is not None
+    assert float(factor[1]) == pytest.approx(2.0, rel=0.1)
+    assert relative_to_rig(built).max() < 1e-6
 
 
 def append(name: str, *lines: str) -> Callable[[Path], None]:

@@ -244,6 +244,85 @@ def test_without_poses_the_same_world_comes_back_up_to_a_similarity(tmp_path: Pa
         assert view.camera == CAMERA
 
 
+def at(x: float, yaw_deg: float = 0.0) -> Pose:
+    """cam_from_rig of a camera at (x, 0, 0) that looks to one side."""
+    rotation = Rotation.from_euler("y", yaw_deg, degrees=True).as_matrix()
+    return Pose(rotation, -rotation @ [x, 0.0, 0.0])
+
+
+def seen_by(world: World, members: Mapping[str, Pose], camera: Camera) -> list[SfmPhoto]:
+    """Photos by each camera of a rig, in order, with half a pixel of noise."""
+    random = np.random.default_rng(3)
+    photos = []
+    for photo in world.photos:
+        assert photo.cam_from_world is not None
+        for sensor, cam_from_rig in members.items():
+            pose = cam_from_rig @ photo.cam_from_world
+            pixels = project(camera, pose.apply(world.points))
+            pixels += random.normal(0, 0.5, pixels.shape)
+            changes = {"sensor": sensor, "camera": camera, "cam_from_world": pose}
+            name, keypoints = f"{sensor}/{photo.name}", pixels.astype(np.float32)
+            photos.append(replace(photo, name=name, keypoints=keypoints, **changes))
+    return photos
+
+
+SIMPLE = Camera("SIMPLE_PINHOLE", 640, 480, (500.0, 320.0, 240.0))
+
+
+@pytest.mark.parametrize(
+    ("members", "left_out", "guess"),
+    [
+        ({"left": at(0), "right": at(0.1, 2)}, (), None),
+        ({"left": at(0), "right": at(1, -3)}, (), None),
+        ({"left": at(-0.3), "right": at(0)}, (), None),
+        ({"a": at(-0.4), "b": at(0, 3), "c": at(0.5)}, (), None),
+        ({"left": at(0), "right": at(0.4)}, (1, 5, 7, 8), None),
+        ({"left": at(0), "right": at(0.4)}, (), 600.0),
+    ],
+    ids=["10 cm", "1 m", "right is the rig", "three", "instants of one camera", "unknown lens"],
+)
+def test_estimated_models_have_the_unit_and_the_distances_of_their_rig(
+    tmp_path: Path, members: dict[str, Pose], left_out: tuple[int, ...], guess: float | None
+) -> None:
+    world = make_world(num_photos=6)
+    taken = [p for row, p in enumerate(seen_by(world, members, SIMPLE)) if row not in left_out]
+    camera = SIMPLE if guess is None else replace(SIMPLE, params=(guess, 320.0, 240.0))
+    photos = [
+        replace(p, cam_from_world=None, camera=camera, camera_known=guess is None) for p in taken
+    ]
+    rows = world.matches[0].rows
+    matches = [Matches(a, b, rows) for a, b in combinations(range(len(photos)), 2)]
+    model = reconstruct(photos, {"rig": members}, matches, CONFIG, (), tmp_path, lambda *_: None)
+    placed = {p.name: v.cam_from_world for p, v in zip(photos, model.views, strict=True) if v}
+    assert len(placed) == len(photos)
+    first, *others = members
+    for name, pose in placed.items():
+        for other in others:
+            if name.startswith(first) and (beside := placed.get(name.replace(first, other, 1))):
+                found, known = beside @ pose.inverse(), members[other] @ members[first].inverse()
+                np.testing.assert_allclose(
+                    found.translation, known.translation, rtol=1e-6, atol=1e-9
+                )
+                np.testing.assert_allclose(found.rotation, known.rotation, atol=1e-9)
+    centers = np.array([placed[photo.name].center for photo in taken])
+    known_centers = np.array([p.cam_from_world.center for p in taken if p.cam_from_world])
+    aligned = align_positions(centers, known_centers, 0.2)
+    assert isinstance(aligned, Alignment), aligned
+    assert aligned.similarity.scale == pytest.approx(1.0, abs=0.01)
+
+
+def test_cameras_of_a_rig_at_one_place_leave_the_unit_open(tmp_path: Path) -> None:
+    world, members = make_world(num_photos=4), {"left": at(0), "right": at(0, 3)}
+    photos = [replace(p, cam_from_world=None) for p in seen_by(world, members, SIMPLE)]
+    rows = world.matches[0].rows
+    matches = [Matches(a, b, rows) for a, b in combinations(range(len(photos)), 2)]
+    model = reconstruct(photos, {"rig": members}, matches, CONFIG, (), tmp_path, lambda *_: None)
+    poses = [view.cam_from_world for view in model.views if view]
+    assert len(poses) == len(photos)
+    for left, right in zip(poses[::2], poses[1::2], strict=True):
+        np.testing.assert_allclose(left.center, right.center, atol=1e-9)
+
+
 def test_photos_that_share_nothing_cannot_be_placed(tmp_path: Path) -> None:
     world = make_world(num_photos=3)
     photos = [replace(photo, cam_from_world=None) for photo in world.photos]
