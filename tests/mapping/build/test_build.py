@@ -167,7 +167,7 @@ def dataset(sample: Path, tmp_path: Path) -> Path:
         (shrink_photo, DatasetError, "dataset.photo_size", FIRST_PHOTO),
         (truncate_depth, DatasetError, "depth.size", "mapping/left/0001.depth"),
         (remove("records_depth.txt"), DatasetError, "dataset.no_depth", "records_depth.txt"),
-        (zero_depth, InvalidInput, "rgbd.no_landmarks", "--depth-scale"),
+        (zero_depth, InvalidInput, "rgbd.no_landmarks", "--depth-sensor"),
     ],
 )
 def test_a_bad_dataset_is_refused_by_name_and_the_map_before_still_serves(
