@@ -51,6 +51,11 @@ _NO_EVIDENCE = (
     Reason.CAMERA_CONTRADICTED,
     Reason.UNLIKELY_POSE,
 )
+_UNFITTING = "the neighbours have poses, but the motion contradicts them or is too long"
+_UNCONFIRMED = (
+    "the motion leads here from one pose alone, and no second photo has confirmed it: odometry in "
+    "another convention or unit would lead elsewhere"
+)
 _CONTRADICTED = Refusal(
     "gate",
     Reason.CONTRADICTS_MOTION,
@@ -113,6 +118,7 @@ class SequenceSolver:
         self._first_timestamp: int | None = None
         self._entries: list[_Entry] = []  # answered ones that still help, then those that wait
         self._num_answered = 0
+        self._confirmed: set[int] = set()  # ticks of supported instants with others on their motion
         self._rest = 0  # instants to come before a window without any pose is searched again
 
     @property
@@ -173,6 +179,7 @@ class SequenceSolver:
         first = max(0, stop - MAX_WAITING)
         while first < stop and self._entries[first].ticks < oldest:
             first += 1
+        self._confirmed -= {entry.ticks for entry in self._entries[:first]}
         del self._entries[:first]
         self._num_answered = stop - first
         return answers
@@ -246,6 +253,8 @@ class SequenceSolver:
                 for j, other in enumerate(found)
                 if other is not None and other.supported and runs[j] == runs[i]
             ]
+            if len(supported) > 1:
+                self._confirmed.update(self._entries[j].ticks for j in supported)
             nearest = min(supported, key=lambda j: self._ticks_between(i, j), default=i)
             if (
                 not linked[i]
@@ -257,6 +266,12 @@ class SequenceSolver:
                 continue
             covariance = pose.covariance
             if not supported[0] <= i <= supported[-1]:
+                is_confirmed = len(supported) > 1 or (
+                    self._entries[supported[0]].ticks in self._confirmed
+                )
+                if not is_confirmed:
+                    answers.append(_unfilled(alone, _UNCONFIRMED))
+                    continue
                 around = supported[:2] if i < supported[0] else supported[:-3:-1]
                 covariance = self._with_unchecked_motion(i, around, found)
             source = PoseSource.ESTIMATED if pose.measured else PoseSource.MOTION
@@ -412,9 +427,9 @@ def _way(a: WindowPose | None, b: WindowPose | None) -> tuple[float, float]:
     return distance, rotation_angle(here.rotation @ there.rotation.T)
 
 
-def _unfilled(alone: InstantAnswer) -> InstantAnswer:
+def _unfilled(alone: InstantAnswer, why: str = _UNFITTING) -> InstantAnswer:
     """Add to the refusal why the neighbours and the motion gave this instant no pose."""
     if alone.pose is not None or alone.refusal is None:
         return alone
-    more = "; the neighbours have poses, but the motion contradicts them or is too long"
-    return replace(alone, refusal=replace(alone.refusal, message=alone.refusal.message + more))
+    message = f"{alone.refusal.message}; {why}"
+    return replace(alone, refusal=replace(alone.refusal, message=message))
