@@ -57,6 +57,8 @@ _ROTATION_DEG, _DIRECTION_DEG = 5.0, 75.0
 _LEAST_FITTING, _ABOUT = 0.4, 0.01
 # Depth that fits the poses to less than this share is right. Kinect's is 1 to 2 % off.
 _DEPTH_OFF = 0.05
+# Only pairs whose relative pose is the given one to within this rotation tell of depth.
+_AGREEING_DEG = 3.0
 _STANDARD_ERRORS = 4.0
 _MAX_NAMES = 100
 _ALONG_RAY = "the distance along the ray"
@@ -297,6 +299,10 @@ def _doubt_about_depth(
     ways, given, stretches, slants = [], [], [], []
     poses = [photo.pose for photo in photos]
     for pair in pairs:
+        # Few matches of a wall may have a relative pose far from the given one, which fits as well.
+        rotation_deg, direction_deg, _ = _errors(poses, pair)
+        if rotation_deg > _AGREEING_DEG or direction_deg > _AGREEING_DEG / _DIRECTION_WEIGHT:
+            continue
         photo = photos[pair.first]
         lifted = lift_keypoints(dataset, photo, pair.pixels, depth_scale)
         if len(lifted.rows) < _LEAST_MATCHES:

@@ -312,7 +312,15 @@ def test_build_shows_each_stage_and_what_was_made(run: Run, sample: Path, tmp_pa
     ends = [line for line in err.splitlines() if not re.search(r" after \d+ s", line)]
     stages = [re.fullmatch(r"([a-z ]+): (\d+)/\2 in [\d.]+ s", line) for line in ends]
     assert [stage and stage[1] for stage in stages] == [
-        *("photos", "local features", "localvlad words", "localvlad", "depth", "own test"),
+        *(
+            "photos",
+            "local features",
+            "localvlad words",
+            "localvlad",
+            "given poses",
+            "depth",
+            "own test",
+        ),
     ]
     opened = open_map(MapStore(tmp_path).folder("room"))
     assert opened.ref in out

@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mapping.methods.rgbd import LiftedKeypoints, lift_keypoints, merge_landmarks
+from mapping.methods.rgbd import (
+    LiftedKeypoints,
+    leave_out_far,
+    lift_keypoints,
+    merge_landmarks,
+)
 from mapping.stages.depth import DepthMatch
 from mapping.stages.photos import MappingPhoto
 from visloc.errors import InvalidInput
@@ -102,7 +107,7 @@ def test_far_from_the_origin_millimetres_survive() -> None:
 
 def test_no_depth_anywhere_is_refused_with_a_hint() -> None:
     with pytest.raises(InvalidInput, match="--depth-sensor"):
-        merge_landmarks([make_photo()], [lifted_at(make_photo())], 0.01)
+        leave_out_far([make_photo()], [lifted_at(make_photo())])
 
 
 def test_a_voxel_size_that_would_overflow_is_refused() -> None:
