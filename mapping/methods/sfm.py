@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import permutations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +48,7 @@ from mapping.methods.sparse.pair_agreement import doubts_about_poses
 from mapping.progress import one_step
 from mapping.stages.camera_mask import CameraMask, where_in_picture
 from mapping.stages.context import BuildContext
-from mapping.stages.landmarks import MadeLandmarks, View, assemble_landmarks
+from mapping.stages.landmarks import MadeLandmarks, View, assemble_landmarks, rows_by_value
 from mapping.stages.photos import MappingPhoto, some
 from mapping.stages.work_folder import key_of
 from visloc.archive import Anchor, GlobalFeatures
@@ -57,6 +58,9 @@ from visloc.geometry import Pose, Similarity
 from visloc.kapture import Dataset
 from visloc.kapture.matches import open_matches
 
+# Points that move less (rms) between the cameras of a rig may as well be at any distance: as many
+# pixels is a match off that is still believed.
+_LEAST_PARALLAX_PX = 4.0
 # When more of the photos have no place, what is missing may be most of the place.
 _MANY_ABSENT = 0.4
 UNPLACED = "nothing says where the photos were taken: the frame and unit are arbitrary"
@@ -263,10 +267,10 @@ def _placed_landmarks(
     anchor = Anchor(kind="dataset", images=len(photos))
     doubts: tuple[Doubt, ...] = ()
     if settings.estimate_poses:
-        in_unit_of_rigs = _is_in_unit_of_rigs(dataset, photos, model)
-        similarity, anchor, on_anchor, doubts = _anchored(
-            dataset, photos, model, keep_unit=in_unit_of_rigs
-        )
+        parallax_px = _rig_parallax_px(photos, model, known_rigs(dataset, used))
+        in_unit_of_rigs = parallax_px >= _LEAST_PARALLAX_PX
+        unit_error = 1 / parallax_px if in_unit_of_rigs else None
+        similarity, anchor, on_anchor, doubts = _anchored(dataset, photos, model, unit_error)
         notes = (*notes, *on_anchor)
         views = [View(v.camera, similarity.move(v.cam_from_world)) for v in views]
         points = similarity.apply(points)
@@ -351,29 +355,44 @@ def known_rigs(
     return {rig: members for rig, members in rigs.items() if members}
 
 
-def _is_in_unit_of_rigs(
-    dataset: Dataset, photos: Sequence[MappingPhoto], model: SparseModel
-) -> bool:
-    """Tell whether rigs held cameras apart from each other at some instant of a model."""
-    rigs = known_rigs(dataset, {photo.record.sensor_id for photo in photos})
+def _rig_parallax_px(photos: Sequence[MappingPhoto], model: SparseModel, rigs: Rigs) -> float:
+    """Return by how far points move (rms) from a photo to one beside it on a rig.
+
+    An error of a pixel in the calibration of the rig changes the unit of a model by about the
+    inverse. 0 where rigs hold no cameras apart.
+    """
+    if not model.on_rigs:
+        return 0.0
     rig_of = {sensor: rig for rig, members in rigs.items() for sensor in members}
-    centers: dict[tuple[str, int], list[NDArray[np.float64]]] = {}
-    for photo, view in zip(photos, model.views, strict=True):
+    beside: dict[tuple[str, int], list[tuple[int, View]]] = {}
+    for row, (photo, view) in enumerate(zip(photos, model.views, strict=True)):
         if view is not None and (rig := rig_of.get(photo.record.sensor_id)) is not None:
-            instant = centers.setdefault((rig, photo.record.timestamp), [])
-            instant.append(rigs[rig][photo.record.sensor_id].center)
-    return model.on_rigs and any(np.any(np.ptp(each, axis=0)) for each in centers.values())
+            beside.setdefault((rig, photo.record.timestamp), []).append((row, view))
+    rays = dict(rows_by_value(model.observations.views))
+    squares = [np.empty(0)]
+    for instant in beside.values():
+        for (row, view), (_, other) in permutations(instant, 2):
+            own = model.observations.points[rays.get(row, np.empty(0, np.int64))]
+            ahead = model.points[own] - view.cam_from_world.center
+            across = np.cross(ahead, other.cam_from_world.center - view.cam_from_world.center)
+            shift = np.linalg.norm(across, axis=1) / np.sum(ahead**2, axis=1)
+            squares.append((view.camera.focal_length * shift) ** 2)
+    every = np.concatenate(squares)
+    return float(np.sqrt(every.mean())) if len(every) else 0.0
 
 
 def _anchored(
-    dataset: Dataset, photos: Sequence[MappingPhoto], model: SparseModel, *, keep_unit: bool
+    dataset: Dataset, photos: Sequence[MappingPhoto], model: SparseModel, unit_error: float | None
 ) -> tuple[Similarity, Anchor, tuple[str, ...], tuple[Doubt, ...]]:
     """Return where an estimated model lies according to known positions, notes and doubts.
 
-    ``keep_unit``: positions move and turn the model, but its scale stays.
+    With ``unit_error``, how far off as a part the model's unit may be, positions move and turn it,
+    but its scale stays.
     """
     free = Similarity.identity(), Anchor(kind="none", images=0)
-    arbitrary = "the frame is arbitrary" if keep_unit else "the frame and unit are arbitrary"
+    arbitrary = (
+        "the frame and unit are arbitrary" if unit_error is None else "the frame is arbitrary"
+    )
     known = known_positions(dataset, photos)
     if known is None:
         return *free, (f"nothing says where the photos were taken: {arbitrary}",), ()
@@ -391,31 +410,34 @@ def _anchored(
     similarity, agrees = found
     centers, positions = centers[agrees], positions[agrees]
     doubts: tuple[Doubt, ...] = ()
-    if keep_unit:
-        doubts = _doubts_about_unit(similarity, centers, positions)
+    if unit_error is not None:
+        doubts = _doubts_about_unit(similarity, centers, positions, unit_error)
         similarity = at_own_scale(similarity, centers, positions)
     aligned = similarity.apply(centers)
     rms = float(np.sqrt(np.mean(np.sum((aligned - positions) ** 2, axis=1))))
     anchor = known.anchor.model_copy(update={"images": int(agrees.sum()), "rms": rms})
     if anchor.geodetic is not None:  # then the world's axes are east, north and up of it
-        error = place_error(anchor.geodetic, aligned, positions, fits_scale=not keep_unit)
+        error = place_error(anchor.geodetic, aligned, positions, fits_scale=unit_error is None)
         geodetic = anchor.geodetic.model_copy(update={"error": error})
         anchor = anchor.model_copy(update={"geodetic": geodetic})
     return similarity, anchor, (), doubts
 
 
 def _doubts_about_unit(
-    similarity: Similarity, centers: NDArray[np.float64], positions: NDArray[np.float64]
+    similarity: Similarity,
+    centers: NDArray[np.float64],
+    positions: NDArray[np.float64],
+    unit_error: float,
 ) -> tuple[Doubt, ...]:
     """Return a doubt where known positions and rigs differ in their unit beyond errors."""
     scale, margin = similarity.scale, scale_margin(similarity.apply(centers), positions)
-    if abs(scale - 1) <= MAX_SCALE_ERROR + scale * margin:
+    allowed = MAX_SCALE_ERROR + scale * margin + unit_error
+    if abs(scale - 1) <= allowed:
         return ()
     message = (
-        f"rigs and known positions contradict each other: the distances between the cameras of "
-        f"rigs.txt give the map its unit, and by {len(positions)} positions it should be "
-        f"{scale:.4g} times as large (+- {scale * margin:.1g}; within {MAX_SCALE_ERROR:.0%} of 1 "
-        "is expected); correct rigs.txt (unit, distances, directions), the intrinsics or the "
-        "positions, whichever is wrong, and build again"
+        "the distances between the cameras of rigs.txt give the map its unit, but by "
+        f"{len(positions)} known positions it should be {scale:.4g} times as large (within "
+        f"{allowed:.0%} of 1 is expected): correct the unit or the distances in rigs.txt, or the "
+        "positions, and build again"
     )
     return (Doubt(kind="unit", message=message),)
