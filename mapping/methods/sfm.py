@@ -409,9 +409,11 @@ def _anchored(
         return *free, (note,), ()
     similarity, agrees = found
     centers, positions = centers[agrees], positions[agrees]
+    notes: tuple[str, ...] = ()
     doubts: tuple[Doubt, ...] = ()
     if unit_error is not None:
-        doubts = _doubts_about_unit(similarity, centers, positions, unit_error)
+        margin = scale_margin(similarity.apply(centers), positions)
+        notes, doubts = _on_unit(similarity.scale, margin, unit_error)
         similarity = at_own_scale(similarity, centers, positions)
     aligned = similarity.apply(centers)
     rms = float(np.sqrt(np.mean(np.sum((aligned - positions) ** 2, axis=1))))
@@ -420,24 +422,23 @@ def _anchored(
         error = place_error(anchor.geodetic, aligned, positions, fits_scale=unit_error is None)
         geodetic = anchor.geodetic.model_copy(update={"error": error})
         anchor = anchor.model_copy(update={"geodetic": geodetic})
-    return similarity, anchor, (), doubts
+    return similarity, anchor, notes, doubts
 
 
-def _doubts_about_unit(
-    similarity: Similarity,
-    centers: NDArray[np.float64],
-    positions: NDArray[np.float64],
-    unit_error: float,
-) -> tuple[Doubt, ...]:
-    """Return a doubt where known positions and rigs differ in their unit beyond errors."""
-    scale, margin = similarity.scale, scale_margin(similarity.apply(centers), positions)
-    allowed = MAX_SCALE_ERROR + scale * margin + unit_error
-    if abs(scale - 1) <= allowed:
-        return ()
+def _on_unit(
+    scale: float, margin: float, unit_error: float
+) -> tuple[tuple[str, ...], tuple[Doubt, ...]]:
+    """Return a note where known positions and rigs differ in their unit, and a doubt if by much.
+
+    ``margin`` is how far off as a part the positions' scale may be, ``unit_error`` that of the rig.
+    """
+    differs = abs(scale - 1) - scale * margin
+    if differs <= MAX_SCALE_ERROR:
+        return (), ()
     message = (
-        "the distances between the cameras of rigs.txt give the map its unit, but by "
-        f"{len(positions)} known positions it should be {scale:.4g} times as large (within "
-        f"{allowed:.0%} of 1 is expected): correct the unit or the distances in rigs.txt, or the "
-        "positions, and build again"
+        "the distances between the cameras of rigs.txt give the map its unit, but by known "
+        f"positions it should be {scale:.4g} times as large (within {MAX_SCALE_ERROR:.0%} of 1 is "
+        "expected): correct rigs.txt, the intrinsics or the positions, and build again"
     )
-    return (Doubt(kind="unit", message=message),)
+    doubtful = differs > MAX_SCALE_ERROR + unit_error
+    return ((), (Doubt(kind="unit", message=message),)) if doubtful else ((message,), ())

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from mapping.build.build import build_map
+from mapping.build.settings import BuildSettings
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.pairing import PAIRINGS, PairSettings
 from mapping.report.cameras import cameras_of
@@ -244,7 +246,7 @@ def test_poses_of_some_photos_anchor_all_of_them(
     assert errors[:, 1].max() < 3.0
 
 
-def relative_to_rig(built: Map) -> NDArray[np.float64]:
+def relative_to_rig(built: Map, instants: int = 8) -> NDArray[np.float64]:
     """How far apart the photos of each instant are, as a part of what the map's rig says."""
     poses = {
         (record.timestamp, record.camera): Pose.from_quaternion(row[:4], row[4:])
@@ -257,7 +259,7 @@ def relative_to_rig(built: Map) -> NDArray[np.float64]:
         for (stamp, sensor), pose in poses.items()
         if sensor == "left" and (stamp, "right") in poses
     ]
-    assert len(found) == 8
+    assert len(found) == instants
     length = np.linalg.norm(known.translation)
     return np.array([np.linalg.norm(p.translation - known.translation) / length for p in found])
 
@@ -286,6 +288,16 @@ def test_a_rig_gives_the_unit_where_nothing_gives_the_place(
     assert built.manifest.world.metric
     assert any(note.endswith("the frame is arbitrary") for note in built.manifest.notes)
     assert relative_to_rig(built).max() < 1e-6
+
+
+@pytest.mark.slow
+def test_photos_of_kitti_stand_apart_as_their_rig_says(shared_data: Path, tmp_path: Path) -> None:
+    dataset = shared_data / "kitti_curve" / "mapping"
+    settings = BuildSettings(dataset, "kitti", tmp_path, method="sfm", sfm=sfm(poses="estimate"))
+    build_map(settings, lambda *_: None)
+    built = MapStore(tmp_path).open("kitti")
+    assert relative_to_rig(built, instants=26).max() < 1e-6
+    assert np.linalg.norm(built.rigs["rig"]["right"].translation) == pytest.approx(0.5371657)
 
 
 def test_a_rig_of_half_its_size_contradicts_the_positions(

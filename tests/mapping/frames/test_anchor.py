@@ -12,6 +12,7 @@ from mapping.frames.anchor import (
     Alignment,
     align_poses,
     align_positions,
+    at_own_scale,
     known_positions,
     scale_doubt,
 )
@@ -219,3 +220,11 @@ def test_a_moved_pose_sees_moved_points_where_it_saw_them() -> None:
     pose = poses_at(CENTERS)[3]
     seen, seen_after = pose.apply(CENTERS), TRUE.move(pose).apply(TRUE.apply(CENTERS))
     np.testing.assert_allclose(seen_after, TRUE.scale * seen, atol=1e-12)
+
+
+def test_a_rigid_fit_keeps_the_scale_and_has_the_middle_and_directions_of_the_positions() -> None:
+    known = TRUE.apply(CENTERS)
+    rigid = at_own_scale(TRUE, CENTERS, known)
+    assert rigid.scale == 1.0
+    np.testing.assert_array_equal(rigid.rotation, TRUE.rotation)
+    np.testing.assert_allclose(rigid.apply(CENTERS).mean(axis=0), known.mean(axis=0), atol=1e-9)

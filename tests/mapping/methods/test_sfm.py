@@ -3,8 +3,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
-from mapping.methods.sfm import _with_their_groups, with_found_cameras
+from mapping.methods.sfm import _on_unit, _rig_parallax_px, _with_their_groups, with_found_cameras
 from mapping.methods.sparse.intrinsics import Doubt
 from mapping.methods.sparse.model import SparseModel
 from mapping.stages.landmarks import Observations, View
@@ -57,3 +58,41 @@ def test_pairs_are_verified_again_with_all_that_were_matched_together() -> None:
     pairs = np.array([[0, 1], [0, 3], [1, 2], [2, 3], [2, 4]])
     absent = np.array([False, False, False, True, False])
     assert pairs[_with_their_groups(pairs, absent)].tolist() == [[0, 1], [0, 3], [2, 3], [2, 4]]
+
+
+@pytest.mark.parametrize(
+    ("baseline", "parallax_px"), [(0.5, 50.0), (0.05, 5.0), (0.0, 0.0)], ids=str
+)
+def test_the_parallax_of_a_rig_is_its_baseline_over_the_depth_in_pixels(
+    baseline: float, parallax_px: float
+) -> None:
+    photos = [photo_of(0, "left"), photo_of(0, "right"), photo_of(1, "left")]
+    rig = {"left": Pose.identity(), "right": Pose(np.eye(3), np.array([-baseline, 0.0, 0.0]))}
+    poses = rig["left"], rig["right"], Pose(np.eye(3), np.array([-9.0, 0.0, 0.0]))
+    first, zeros = np.zeros(1, np.int64), np.zeros((1, 2), np.float32)
+    model = SparseModel(
+        tuple(View(FOUND, pose) for pose in poses),
+        np.array([[0.0, 0.0, 5.0]]),
+        Observations(first, first, first, zeros),
+        np.zeros(1, np.float32),
+        True,
+        {},
+    )
+    assert _rig_parallax_px(photos, model, {"rig": rig}) == pytest.approx(parallax_px)
+
+
+@pytest.mark.parametrize(
+    ("scale", "margin", "unit_error", "noted", "doubted"),
+    [
+        (1.04, 0.001, 0.02, False, False),
+        (0.9, 0.06, 0.02, False, False),  # the positions are as inexact
+        (0.92, 0.003, 0.05, True, False),  # the rig may be
+        (0.92, 0.003, 0.01, False, True),
+        (0.5, 0.01, 0.2, False, True),
+    ],
+)
+def test_positions_that_contradict_the_unit_of_rigs_are_noted_or_make_a_doubt(
+    scale: float, margin: float, unit_error: float, noted: bool, doubted: bool
+) -> None:
+    notes, doubts = _on_unit(scale, margin, unit_error)
+    assert (bool(notes), [doubt.kind for doubt in doubts]) == (noted, ["unit"] * doubted)
