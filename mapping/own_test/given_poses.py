@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mapping.methods.matching.two_views import relative_pose
 from mapping.methods.rgbd import lift_keypoints
@@ -215,7 +215,7 @@ def _doubt_about_poses(
     is_named = left[name] <= min(_NAMED_SHARE * total, _NAMED_MOST, total - _NAMED_LESS)
     if not is_named and (
         (rotation_deg <= _ROTATION_DEG and direction_deg <= _DIRECTION_DEG)
-        or np.median([_fitting(given, pair) for pair in pairs]) >= _LEAST_FITTING
+        or _median([_fitting(given, pair) for pair in pairs], pairs) >= _LEAST_FITTING
     ):
         return None
     advice = (
@@ -262,12 +262,25 @@ def _readings(written: Sequence[_Written]) -> Mapping[str, Callable[[], list[Pos
 
 def _disagreement(poses: Sequence[Pose], pairs: Sequence[_Pair]) -> tuple[float, float]:
     """Return the median errors of poses in degrees: of rotations, and of directions."""
-    rotations, directions, lengths = np.array([_errors(poses, pair) for pair in pairs]).T
-    clear = np.array([pair.parallax_deg > _LEAST_PARALLAX_DEG for pair in pairs])
-    if not clear.any():
-        return float(np.median(rotations)), 0.0
-    far = clear & (lengths >= np.median(lengths[clear]))
-    return float(np.median(rotations)), float(np.median(directions[far]))
+    errors = np.array([_errors(poses, pair) for pair in pairs])
+    rotation_deg = _median(errors[:, 0], pairs)
+    clear = [row for row, pair in enumerate(pairs) if pair.parallax_deg > _LEAST_PARALLAX_DEG]
+    if not clear:
+        return rotation_deg, 0.0
+    least = np.median(errors[clear, 2])
+    far = [row for row in clear if errors[row, 2] >= least]
+    return rotation_deg, _median(errors[far, 1], [pairs[row] for row in far])
+
+
+def _median(values: ArrayLike, pairs: Sequence[_Pair]) -> float:
+    """Return the median of a value (n,) of n pairs, each weighed by its matches.
+
+    Pairs of few matches are more often of places that look alike.
+    """
+    each = np.asarray(values, np.float64)
+    order = np.argsort(each)
+    weights = np.cumsum([len(pairs[row].rays[0]) for row in order])
+    return float(each[order[np.searchsorted(weights, weights[-1] / 2)]])
 
 
 def _fitting(poses: Sequence[Pose], pair: _Pair) -> float:
