@@ -105,7 +105,7 @@ def landmarks_from_depth(
             lifted = deque(replace(one, points=move.apply(one.points)) for one in lifted)
             photos = [replace(photo, cam_from_world=move.move(photo.pose)) for photo in photos]
         depth, notes = leave_out_far(photos, lifted)
-        voxel_size = settings.voxel_size or _rounded(depth * _VOXEL_OF_DEPTH)
+        voxel_size = settings.voxel_size or rounded_length(depth * _VOXEL_OF_DEPTH)
         # Handed over one by one, so that memory holds few of them twice.
         handed = (lifted.popleft() for _ in photos)
         landmarks, rows = merge_landmarks(photos, handed, voxel_size)
@@ -216,7 +216,7 @@ def leave_out_far(
     )
 
 
-def _rounded(length: float) -> float:
+def rounded_length(length: float) -> float:
     """Round to 1, 2 or 5 times a power of ten: scenes that differ a little get the same cells."""
     exponent = math.floor(math.log10(length))
     steps = [float(f"{step}e{exponent}") for step in (1, 2, 5, 10)]

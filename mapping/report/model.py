@@ -24,10 +24,11 @@ from visloc.archive import Map
 from visloc.geometry import Camera, Pose
 from visloc.localization.geometry.viewpoints import Viewpoints
 
-# What counts as localized. In metric maps the high precision of Sattler et al. 2018; in others as
-# much of the distance from which photos see as the angle is of a turn.
+# What counts as localized. In metric maps the high precision of Sattler et al. 2018, within shares
+# of the distance from which photos see: it would mean nothing around a coin, and too much above a
+# town. In others as much of that distance as the angle is of a turn.
 _POSITION_M, _ORIENTATION_DEG = 0.25, 2.0
-_POSITION_OF_REACH = 0.05
+_LEAST_OF_REACH, _POSITION_OF_REACH, _MOST_OF_REACH = 0.01, 0.05, 0.2
 _NUM_FOLDS = 5
 _NOISE_PX = 1.0  # of a map without runs
 _MEDIAN_OF_RAYLEIGH = 1.1774  # by the standard deviation along each axis
@@ -122,8 +123,10 @@ class _Seen:
 
 def tolerance_of(opened: Map, viewpoints: Viewpoints) -> Within:
     """Return the distances within which photos of a map count as localized."""
-    metric = opened.manifest.world.metric
-    position = _POSITION_M if metric else _POSITION_OF_REACH * viewpoints.reach
+    reach = viewpoints.reach
+    position = _POSITION_OF_REACH * reach
+    if opened.manifest.world.metric:
+        position = min(max(_POSITION_M, _LEAST_OF_REACH * reach), _MOST_OF_REACH * reach)
     return Within(position, _ORIENTATION_DEG)
 
 

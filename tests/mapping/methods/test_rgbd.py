@@ -11,6 +11,7 @@ from mapping.methods.rgbd import (
     leave_out_far,
     lift_keypoints,
     merge_landmarks,
+    rounded_length,
 )
 from mapping.stages.depth import DepthMatch
 from mapping.stages.photos import MappingPhoto
@@ -108,6 +109,32 @@ def test_far_from_the_origin_millimetres_survive() -> None:
 def test_no_depth_anywhere_is_refused_with_a_hint() -> None:
     with pytest.raises(InvalidInput, match="--depth-sensor"):
         leave_out_far([make_photo()], [lifted_at(make_photo())])
+
+
+def test_keypoints_beyond_a_thousand_medians_are_left_out_and_counted() -> None:
+    photos = [make_photo("a.jpg"), make_photo("b.jpg", Pose.identity())]
+    seen = [(0.0, 0.0, 0.04), (0.0, 0.0, 0.05), (0.0, 0.0, 49.0), (0.0, 0.0, 1e10)]
+    at_depths = [POSE.inverse().apply(np.array(seen)), np.array([(0.0, 0.0, 0.05)])]
+    lifted = [
+        lifted_at(photo, *map(tuple, points))
+        for photo, points in zip(photos, at_depths, strict=True)
+    ]
+
+    median, notes = leave_out_far(photos, lifted)
+
+    assert median == pytest.approx(0.05)
+    assert [one.rows.tolist() for one in lifted] == [[0, 2, 4], [0]]
+    assert [len(one.points) for one in lifted] == [len(one.pixels) for one in lifted] == [3, 1]
+    assert len(notes) == 1
+    assert notes[0].startswith("1 of 5 keypoints")
+
+
+@pytest.mark.parametrize(
+    ("length", "rounded"),
+    [(0.0095, 0.01), (0.0072, 0.01), (0.014, 0.01), (0.0145, 0.02), (2.09e-4, 2e-4), (10.04, 10.0)],
+)
+def test_voxels_are_rounded_to_1_2_or_5_times_a_power_of_ten(length: float, rounded: float) -> None:
+    assert rounded_length(length) == rounded
 
 
 def test_a_voxel_size_that_would_overflow_is_refused() -> None:

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -158,13 +160,19 @@ def test_the_standard_deviation_learns_how_large_errors_are():
     assert precision.std(Outlook(2.0, np.inf, 0.3)) == np.inf
 
 
-def test_a_map_in_no_unit_has_a_tolerance_relative_to_what_is_seen(make_map, looking, room):
-    points = room(np.random.default_rng(0), 400)
+@pytest.mark.parametrize(
+    ("scale", "metric", "of_reach"),
+    [(1.0, True, None), (1.0, False, 0.05), (1 / 60, True, 0.2), (800.0, True, 0.01)],
+)
+def test_a_tolerance_is_25_cm_within_shares_of_what_is_seen_in_metric_maps(
+    make_map, looking, room, scale, metric, of_reach
+):
     poses = [looking((0.0, 0.0, 0.0), 90.0 * i) for i in range(3)]
-    metric, other = make_map(points, poses), make_map(points, poses, metric=False)
-    assert tolerance_of(metric, MapGeometry(metric).viewpoints) == Within(0.25, 2.0)
-    reach = MapGeometry(other).viewpoints.reach
-    assert tolerance_of(other, MapGeometry(other).viewpoints) == Within(0.05 * reach, 2.0)
+    opened = make_map(room(np.random.default_rng(0), 400), poses, metric=metric)
+    viewpoints = MapGeometry(opened).viewpoints
+    viewpoints = replace(viewpoints, reach=scale * viewpoints.reach)
+    expected = 0.25 if of_reach is None else of_reach * viewpoints.reach
+    assert tolerance_of(opened, viewpoints) == Within(expected, 2.0)
 
 
 def test_a_run_is_judged_by_position_and_orientation():

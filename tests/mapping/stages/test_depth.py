@@ -71,7 +71,7 @@ def test_a_raw_map_is_metres_row_by_row(tmp_path: Path) -> None:
 
 def test_invalid_values_of_a_raw_map_are_nan(tmp_path: Path) -> None:
     values = [0.0, -0.0, -1.0, math.nan, math.inf, -math.inf, 65.535]
-    valid = [65.5, 1e30, 65.49, 1e-3, 2.0]
+    valid = [65.534, 65.536, 1e-5, 250.0, 5000.0]
     depth = read_depth(write_raw(tmp_path / "a", values + valid), SMALL, 0.001).ravel()
     assert np.isnan(depth[:7]).all()
     np.testing.assert_array_equal(depth[7:], np.array(valid, dtype=np.float32))
