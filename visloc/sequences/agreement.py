@@ -15,7 +15,7 @@ from visloc.pose.motion import UncertainPose, chain, difference
 # Quantiles of chi-square with six degrees of freedom: 0.5, 0.99 and 0.999.
 _CHI2_HALF = 5.35
 _CHI2_99 = 16.81
-_CHI2_999 = 22.46
+CHI2_999 = 22.46
 # A measured pose may be off by more than its covariance tells, because maps have errors that
 # many points share: 0.1 degrees and 1 cm. Only more than that is a contradiction.
 _MAP_ERROR = np.diag([math.radians(0.1) ** 2] * 3 + [0.01**2] * 3)
@@ -41,7 +41,7 @@ class Piece:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Comparison:
+class Comparison:
     """A measured pose beside an earlier one that the motion carried on.
 
     Attributes:
@@ -58,10 +58,10 @@ class _Comparison:
         """The squared error, normalized, were the motion's covariance ``factor`` times larger."""
         return float(self.error @ np.linalg.solve(self.poses + factor * self.motion, self.error))
 
-    @property
-    def contradicts(self) -> bool:
-        total = self.poses + self.motion + 2.0 * _MAP_ERROR
-        return float(self.error @ np.linalg.solve(total, self.error)) > _CHI2_999
+    def contradicts(self, factor: float = 1.0) -> bool:
+        """Whether more than chance and the map's errors is left, with ``factor`` as in ``chi2``."""
+        total = self.poses + factor * self.motion + 2.0 * _MAP_ERROR
+        return float(self.error @ np.linalg.solve(total, self.error)) > CHI2_999
 
 
 def agreeing_pieces(
@@ -90,7 +90,7 @@ def agreeing_pieces(
     anchors, comparisons = _without_outliers(measured, links)
     runs = [[anchors[0]]]
     for anchor, comparison in zip(anchors[1:], comparisons, strict=True):
-        if comparison.contradicts:
+        if comparison.contradicts():
             runs.append([anchor])
         else:
             runs[-1].append(anchor)
@@ -110,38 +110,39 @@ def agreeing_pieces(
 
 def _without_outliers(
     measured: Mapping[int, UncertainPose], links: Sequence[UncertainPose]
-) -> tuple[list[int], list[_Comparison]]:
+) -> tuple[list[int], list[Comparison]]:
     """The instants that count, and the comparisons of each with the next."""
     everyone = sorted(measured)
-    comparisons = [_compare(a, b, measured, links) for a, b in itertools.pairwise(everyone)]
+    comparisons = [compare(a, b, measured, links) for a, b in itertools.pairwise(everyone)]
     kept, fits = list(everyone), list(comparisons)
     i = 1
     while i < len(kept) - 1:
-        if fits[i - 1].contradicts and fits[i].contradicts:
-            across = _compare(kept[i - 1], kept[i + 1], measured, links)
-            if not across.contradicts:
+        if fits[i - 1].contradicts() and fits[i].contradicts():
+            across = compare(kept[i - 1], kept[i + 1], measured, links)
+            if not across.contradicts():
                 del kept[i]
                 fits[i - 1 : i + 1] = [across]
                 continue
         i += 1
-    if len(kept) >= _MIN_WITNESSES and not any(fit.contradicts for fit in fits):
+    if len(kept) >= _MIN_WITNESSES and not any(fit.contradicts() for fit in fits):
         return kept, fits
     return everyone, comparisons
 
 
-def _compare(
+def compare(
     a: int, b: int, measured: Mapping[int, UncertainPose], links: Sequence[UncertainPose]
-) -> _Comparison:
+) -> Comparison:
+    """Compare the measured pose of instant b with that of a, carried there by the motion."""
     motion = chain(links, a, b)
     predicted = UncertainPose(motion.pose, np.zeros((6, 6))) @ measured[a]
-    return _Comparison(
+    return Comparison(
         error=difference(measured[b].pose, predicted.pose),
         poses=predicted.covariance + measured[b].covariance,
         motion=motion.covariance,
     )
 
 
-def _factor(comparisons: Sequence[_Comparison], expected: float) -> float:
+def _factor(comparisons: Sequence[Comparison], expected: float) -> float:
     """Return the factor on the motion's covariance that makes the median chi-square expected."""
     factor = 1.0
     while comparisons and factor < _MAX_FACTOR:

@@ -30,9 +30,16 @@ from visloc.localization.solving import (
 )
 from visloc.options import LEAST_PROBABILITY, LocalizeOptions
 from visloc.pose.centre import with_origin
-from visloc.pose.motion import RelativeMotion, default_motion_covariance, link_from_motion
+from visloc.pose.motion import RelativeMotion, UncertainPose, link_from_motion
 from visloc.priors import Priors
 from visloc.sequences.filling import MAX_GAP_S, Odometry, TimeUnit, TracedPose, fill_sequence
+from visloc.sequences.odometry_readings import (
+    ALL_READINGS,
+    AS_SENT,
+    lead_elsewhere,
+    link_between,
+    narrowed,
+)
 from visloc.sequences.window import WindowInstant, WindowPose, solve_window
 from visloc.timing import timed
 from visloc.types import InstantAnswer, PoseSource, Reason, Refusal, RigPose
@@ -51,16 +58,12 @@ _NO_EVIDENCE = (
     Reason.CAMERA_CONTRADICTED,
     Reason.UNLIKELY_POSE,
 )
-_UNFITTING = "the neighbours have poses, but the motion contradicts them or is too long"
-_UNCONFIRMED = (
-    "the motion leads here from one pose alone, and no second photo has confirmed it: odometry in "
-    "another convention or unit would lead elsewhere"
-)
 _CONTRADICTED = Refusal(
     "gate",
     Reason.CONTRADICTS_MOTION,
     "the pose from its own images contradicts the neighbours' poses and the motion between them",
 )
+_CONTRADICTS_PHOTOS = "contradicts the photos"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,7 +121,7 @@ class SequenceSolver:
         self._first_timestamp: int | None = None
         self._entries: list[_Entry] = []  # answered ones that still help, then those that wait
         self._num_answered = 0
-        self._confirmed: set[int] = set()  # ticks of supported instants with others on their motion
+        self._readings = ALL_READINGS  # of the odometry, that fit the photos so far
         self._rest = 0  # instants to come before a window without any pose is searched again
 
     @property
@@ -179,7 +182,6 @@ class SequenceSolver:
         first = max(0, stop - MAX_WAITING)
         while first < stop and self._entries[first].ticks < oldest:
             first += 1
-        self._confirmed -= {entry.ticks for entry in self._entries[:first]}
         del self._entries[:first]
         self._num_answered = stop - first
         return answers
@@ -218,9 +220,7 @@ class SequenceSolver:
             if a is None or b is None or after.ticks - before.ticks > self._max_gap:
                 motions.append(None)
                 continue
-            motion = b.rig_from_odometry @ a.rig_from_odometry.inverse()
-            covariance = default_motion_covariance(motion) if b.covariance is None else b.covariance
-            given = RelativeMotion(motion, covariance)
+            given = RelativeMotion(*link_between(a, b))
             motions.append(given if link_from_motion(given) is not None else None)
         return motions
 
@@ -242,38 +242,35 @@ class SequenceSolver:
                 seed=self._options.seed,
             )
             self._rest = _BLIND_REST if blind and not any(found) else 0
-        runs = np.cumsum([0, *(motion is None for motion in motions)])
+        cuts = [i for i, motion in enumerate(motions, 1) if motion is None]
+        bounds = pairwise([0, *cuts, len(found)])
+        run_of = [run for a, b in bounds for run in [range(a, b)] * (b - a)]
+        for run in dict.fromkeys(run_of):
+            self._narrow_readings(run, found)
         answers = []
         for i, (entry, pose) in enumerate(zip(self._entries, found, strict=True)):
             alone = entry.solved.answer
             if linked[i] and alone.pose is not None and (pose is None or not pose.measured):
                 alone = replace(alone, pose=None, refusal=_CONTRADICTED)
-            supported = [
-                j
-                for j, other in enumerate(found)
-                if other is not None and other.supported and runs[j] == runs[i]
-            ]
-            if len(supported) > 1:
-                self._confirmed.update(self._entries[j].ticks for j in supported)
-            nearest = min(supported, key=lambda j: self._ticks_between(i, j), default=i)
-            if (
-                not linked[i]
-                or pose is None
-                or not supported
-                or self._ticks_between(i, nearest) > self._max_gap
-            ):
-                answers.append(_unfilled(alone) if linked[i] and supported else alone)
+            supported = [j for j in run_of[i] if (other := found[j]) and other.supported]
+            if not linked[i] or not supported:
+                answers.append(alone)
+                continue
+            nearest = min(supported, key=lambda j: self._ticks_between(i, j))
+            if pose is None or self._ticks_between(i, nearest) > self._max_gap:
+                answers.append(
+                    self._unfilled(alone, "is too long" if pose else _CONTRADICTS_PHOTOS)
+                )
                 continue
             covariance = pose.covariance
             if not supported[0] <= i <= supported[-1]:
-                is_confirmed = len(supported) > 1 or (
-                    self._entries[supported[0]].ticks in self._confirmed
-                )
-                if not is_confirmed:
-                    answers.append(_unfilled(alone, _UNCONFIRMED))
-                    continue
                 around = supported[:2] if i < supported[0] else supported[:-3:-1]
                 covariance = self._with_unchecked_motion(i, around, found)
+            if not pose.supported:
+                why = self._disbelief(run_of[i], nearest, i, pose)
+                if why is not None:
+                    answers.append(self._unfilled(alone, why))
+                    continue
             source = PoseSource.ESTIMATED if pose.measured else PoseSource.MOTION
             answers.append(
                 self._with_pose(
@@ -286,6 +283,41 @@ class SequenceSolver:
                 )
             )
         return answers
+
+    def _narrow_readings(self, run: range, found: Sequence[WindowPose | None]) -> None:
+        measured = {
+            j - run.start: UncertainPose.from_additive(pose.rig_from_world, pose.covariance)
+            for j in run
+            if (pose := found[j]) and pose.measured
+        }
+        self._readings = narrowed(self._readings, self._odometry(run), measured)
+
+    def _odometry(self, run: range) -> list[Odometry]:
+        entries = self._entries[run.start : run.stop]
+        return [entry.seen.odometry for entry in entries if entry.seen.odometry is not None]
+
+    def _disbelief(self, run: range, nearest: int, i: int, found: WindowPose) -> str | None:
+        """Why the pose of instant i, carried by motion from the nearest supported, is not given."""
+        if AS_SENT not in self._readings:
+            return _CONTRADICTS_PHOTOS
+        ends = nearest - run.start, i - run.start
+        there = UncertainPose.from_additive(found.rig_from_world, found.covariance)
+        if lead_elsewhere(self._readings, self._odometry(run), *ends, there.covariance):
+            return "is not confirmed: the photos so far fit other conventions, too"
+        away = np.linalg.norm(self._geometry.centers - there.pose.center, axis=1).min()
+        if away > self._geometry.reach:
+            return f"leads out of the map, {away:.2f} from its nearest photo"
+        return None
+
+    def _unfilled(self, alone: InstantAnswer, why: str) -> InstantAnswer:
+        """Add to the refusal why the neighbours and the motion gave this instant no pose."""
+        if alone.pose is not None or alone.refusal is None:
+            return alone
+        message = f"{alone.refusal.message}; the neighbours have poses, but the motion {why}"
+        if AS_SENT not in self._readings and len(self._readings) == 1:
+            (name,) = self._readings
+            message += f". The odometry looks like {name}: send rig_from_odometry in metres"
+        return replace(alone, refusal=replace(alone.refusal, message=message))
 
     def _window_instant(self, solved: Solved) -> WindowInstant:
         refusal, errors = solved.answer.refusal, self._geometry.errors
@@ -425,11 +457,3 @@ def _way(a: WindowPose | None, b: WindowPose | None) -> tuple[float, float]:
     here, there = a.rig_from_world, b.rig_from_world
     distance = float(np.linalg.norm(here.center - there.center))
     return distance, rotation_angle(here.rotation @ there.rotation.T)
-
-
-def _unfilled(alone: InstantAnswer, why: str = _UNFITTING) -> InstantAnswer:
-    """Add to the refusal why the neighbours and the motion gave this instant no pose."""
-    if alone.pose is not None or alone.refusal is None:
-        return alone
-    message = f"{alone.refusal.message}; {why}"
-    return replace(alone, refusal=replace(alone.refusal, message=message))

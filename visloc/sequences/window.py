@@ -104,9 +104,10 @@ def solve_window(
        were not measured but agree with the pose that the others give them. The errors of the map,
        which all instants share, are added once at the end.
 
-    A wrong motion that no measured pose contradicts, as beyond the last one, cannot be seen:
-    there, the covariance is as honest as that of the motion. A motion that claims to be exact and
-    is off by less than the measured poses are unsure pulls them along by that much.
+    A wrong motion that no measured pose contradicts, as beyond the last one, cannot be seen here
+    (but see ``visloc.sequences.odometry_readings``): there, the covariance is as honest as that of
+    the motion. A motion that claims to be exact and is off by less than the measured poses are
+    unsure pulls them along by that much.
 
     Args:
         instants: consecutive, N.
