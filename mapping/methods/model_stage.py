@@ -34,7 +34,7 @@ from mapping.stages.work_folder import Item, WorkFolder, key_of
 from visloc.geometry import Camera, Pose
 
 # Raised when the code of the stage changes what comes out.
-_REVISION = 19
+_REVISION = 20
 _LATE_REVISION = 2
 _LATE = "late photos"
 _LARGEST = 127  # of descriptors in 8 bits

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from mapping.methods.matching.stages import Matches
 from mapping.methods.sparse.colmap_scene import Rigs
 from mapping.methods.sparse.contradictions import ModelPhoto, Places, find_places
+from mapping.methods.sparse.look_alikes import without_look_alikes
 from mapping.methods.sparse.model import MapperConfig, SfmPhoto, SparseModel
 from mapping.methods.sparse.pair_agreement import contradicted_pairs
 from mapping.methods.sparse.triangulation import reconstruct
@@ -22,6 +23,9 @@ from visloc.errors import InvalidInput
 
 # At most so many models are made. Errors of the last one stay, and the map's own test reports them.
 _MOST_MODELS = 4
+# Matches of a pair that is tried although it may look alike. In a collection of ten photos, most
+# true ones have 240 to 690; pairs that fold other walls of a lobby onto its map have 70 to 160.
+_MANY_MATCHES = 200
 PLACES = "look-alike places"
 
 
@@ -79,12 +83,21 @@ def _of_all_pairs(
     work: Path,
     progress: Progress,
 ) -> SparseModel | None:
-    """Reconstruct with pairs of photos that may look alike, too; None if that shows two places.
+    """Reconstruct with pairs that look alike by many matches, too; None if two places show.
 
     The filter of look-alike pairs also drops true ones, such as those of a wide photo and of one
-    from nearby. A photo has no place if most of its matches contradict the pose that it gets.
+    from nearby. Of those with few matches, most are wrong. A photo has no place if most of its
+    matches contradict the pose that it gets.
     """
     how = config, refine, work, progress
+    believed = {(p.first, p.second) for p in without_look_alikes(photos, matches)}
+    matches = [
+        pair
+        for pair in matches
+        if len(pair.rows) >= _MANY_MATCHES or (pair.first, pair.second) in believed
+    ]
+    if len(matches) == len(believed):
+        return None
     try:
         model = reconstruct(photos, rigs, matches, *how, filtered=False)
         against, _ = contradicted_pairs(model, photos, matches, config.filter_max_reproj_error)
