@@ -108,10 +108,12 @@ def landmarks_from_matches(
     rigs = known_rigs(dataset, {photo.record.sensor_id for photo in photos})
     model = make_model(context, photos, rigs, *matched, settings)
     models: list[tuple[SparseModel, tuple[Doubt, ...]]] = [(model, ())]
+    notes = _notes_on_fixed(photos, fixed)
     if settings.estimate_poses:
         look = _Look(context, photos, rigs, pairs.rows, verification, settings)
-        models = look.models(model, *matched)
-    notes = (*_notes_on_fixed(photos, fixed), *_notes_on_absent(photos, [one for one, _ in models]))
+        models, believed = look.models(model, *matched)
+        made = [one for one, _ in models]
+        notes = (*notes, *_notes_on_absent(photos, made, matched[0], believed))
     placed = (
         (_placed_landmarks(dataset, photos, one, settings, metric=metric, notes=notes), doubts)
         for one, doubts in models
@@ -157,10 +159,10 @@ class _Look:
 
     def models(
         self, model: SparseModel, matches: list[Matches], matches_key: str
-    ) -> list[tuple[SparseModel, tuple[Doubt, ...]]]:
+    ) -> tuple[list[tuple[SparseModel, tuple[Doubt, ...]]], list[Matches]]:
         """Return a model with more of the photos, and models of the photos that it still lacks.
 
-        With what speaks against the poses of each.
+        With what speaks against the poses of each; and the pairs that seem to show one place.
 
         The cameras that the model found help. When many photos found no place, all are mapped anew.
         Else those without one are placed in the model as it is.
@@ -191,7 +193,7 @@ class _Look:
 
         made = (model, *models_beside(model, believed, make))
         given, error = without_poses(self.context, begun), self.verification.max_error_px
-        return [(one, doubts_about_poses(one, given, believed, error)) for one in made]
+        return [(one, doubts_about_poses(one, given, believed, error)) for one in made], believed
 
     def _with_late(self, model: SparseModel, verified: _Matched) -> SparseModel:
         return with_latecomers(
@@ -312,7 +314,10 @@ def _notes_on_fixed(
 
 
 def _notes_on_absent(
-    photos: Sequence[MappingPhoto], models: Sequence[SparseModel]
+    photos: Sequence[MappingPhoto],
+    models: Sequence[SparseModel],
+    matches: Sequence[Matches],
+    believed: Sequence[Matches],
 ) -> tuple[str, ...]:
     """Return notes on pairs that were not used, and photos that are in no model."""
     notes = []
@@ -322,9 +327,20 @@ def _notes_on_absent(
             "moved, joined them, and photos in the joined model missed what others beside them saw"
         )
     views = zip(*(model.views for model in models), strict=True)
-    absent = [p.name for p, seen in zip(photos, views, strict=True) if not any(seen)]
+    absent = {row for row, seen in enumerate(views) if not any(seen)}
     if absent:
-        notes.append(f"{len(absent)} of {len(photos)} photos found no place: {some(absent)}")
+        names = some([photos[row].name for row in sorted(absent)])
+        note = f"{len(absent)} of {len(photos)} photos found no place: {names}"
+        theirs, used = (
+            sum(not absent.isdisjoint((pair.first, pair.second)) for pair in pairs)
+            for pairs in (matches, believed)
+        )
+        if used < theirs:
+            note += (
+                f"; {theirs - used} of the {theirs} pairs that match them were not used, as their "
+                "photos seem to show places that look alike"
+            )
+        notes.append(note)
     return tuple(notes)
 
 

@@ -129,6 +129,13 @@ def doubts_about_given(
     return () if doubt is None else (doubt,)
 
 
+def readings_of(
+    dataset: Dataset, photos: Sequence[MappingPhoto]
+) -> Mapping[str, Callable[[], list[Pose]]]:
+    """Return the poses of all photos as other conventions have them, by the name of each."""
+    return _readings([_written(dataset, photo) for photo in photos])
+
+
 def _written(dataset: Dataset, photo: MappingPhoto) -> _Written:
     record = photo.record
     for rig in dataset.rigs_of(record.sensor_id):
@@ -236,8 +243,6 @@ def _doubt_about_poses(
 
 
 def _readings(written: Sequence[_Written]) -> Mapping[str, Callable[[], list[Pose]]]:
-    """Return the poses of all photos as other conventions have them, by the name of each."""
-
     def read(reading: Callable[[Pose], Pose]) -> list[Pose]:
         return [one.camera_from_device @ reading(one.device_from_world) for one in written]
 

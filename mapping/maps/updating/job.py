@@ -47,6 +47,7 @@ from mapping.methods.rgbd import (
 )
 from mapping.methods.sfm import landmarks_from_matches
 from mapping.methods.sfm_settings import SfmSettings
+from mapping.own_test.given_poses import readings_of
 from mapping.own_test.publishing import publish_edited
 from mapping.progress import Progress
 from mapping.stages.colours import landmark_colours
@@ -196,6 +197,7 @@ class _Job:
             placed,
             settings.poses,
             self._lifted if by_depth else None,
+            readings_of(self.dataset, tried.photos),
             metric=settings.metric,
         )
         if settings.poses == "localize":

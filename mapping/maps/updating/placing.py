@@ -101,6 +101,7 @@ def place_capture(
     placed: Sequence[Placed],
     poses: str,
     lift: Lift | None,
+    readings: Mapping[str, Callable[[], list[Pose]]],
     *,
     metric: bool,
 ) -> Placement:
@@ -113,6 +114,7 @@ def place_capture(
         poses: a name of ``mapping.maps.updating.settings.POSES``.
         lift: lifts pixels by the depth of their photo. Depth is compared with the map, and refines
             a tie. None without depth.
+        readings: the photos' own poses as other conventions have them, to name a mistake.
         metric: whether a unit of the photos' own poses is a metre.
 
     Raises:
@@ -135,8 +137,9 @@ def place_capture(
     else:
         agrees = [_fits(photo, one) for photo, one in both]
         if sum(agrees) <= len(both) / 2:  # a tie needs more than half, too
+            named = _named(photos, placed, readings)
             raise _elsewhere(
-                f"{localized}, but only {sum(agrees)} where --poses given has them",
+                f"{localized}, but only {sum(agrees)} where --poses given has them{named}",
                 "poses in the map's frame, or --poses tie",
             )
     if lift is not None:
@@ -253,6 +256,20 @@ def _placement(
         float(np.nanmedian(pixels)),
         *np.median(errors, axis=0).tolist(),
     )
+
+
+def _named(
+    photos: Sequence[MappingPhoto],
+    placed: Sequence[Placed],
+    readings: Mapping[str, Callable[[], list[Pose]]],
+) -> str:
+    """Name the convention in which most of the photos' own poses fit the map, if any."""
+    for name, read in readings.items():
+        own = [replace(p, cam_from_world=pose) for p, pose in zip(photos, read(), strict=True)]
+        both = [(p, one) for p, one in zip(own, placed, strict=True) if one.localized]
+        if sum(_fits(*each) for each in both) > len(both) / 2:
+            return f". They look like {name}"
+    return ""
 
 
 def _fits(photo: MappingPhoto, one: Placed) -> bool:

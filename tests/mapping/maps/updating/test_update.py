@@ -244,6 +244,18 @@ def test_poses_that_are_not_in_the_maps_frame_are_refused(captures: Path, maps_d
     assert "--poses" in str(error)
 
 
+def test_poses_of_another_convention_are_refused_with_its_name(
+    captures: Path, maps_dir: Path, tmp_path: Path
+) -> None:
+    dataset, written = read_dataset(captures / "in_frame"), tmp_path / "written"
+    poses = {key: pose.inverse() for key, pose in dataset.trajectories.items()}
+    ignored = shutil.ignore_patterns("*.txt")
+    shutil.copytree(captures / "in_frame", written, symlinks=True, ignore=ignored)
+    write_dataset(replace(dataset, root=written, trajectories=poses))
+    error = refused(written, maps_dir, poses="given")
+    assert "They look like camera-to-world poses" in str(error)
+
+
 def test_a_trajectory_that_is_no_similarity_away_is_refused(
     captures: Path, maps_dir: Path, tmp_path: Path
 ) -> None:
