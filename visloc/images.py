@@ -32,6 +32,8 @@ from visloc.photo_formats import (
 )
 
 Pixel = TypeVar("Pixel", bound=np.generic)
+# EXIF's focal length is hardly better than such a zoom.
+_NO_ZOOM = 0.02
 # CIPA DCG-001: the 35 mm equivalent compares diagonals; that of a 36 mm x 24 mm frame.
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF FocalPlaneResolutionUnit
@@ -79,6 +81,7 @@ class Photo:
             (2, 4 or 8) each side of a pixel of ``rgb`` spans. (u, v) in the file is
             (u / reduced, v / reduced) in ``rgb``; columns and rows that fill no pixel are left out.
         file_size: width and height of the file's pixels; None when they are those of ``rgb``.
+        camera_name: make and model from EXIF, and its digital zoom if used; "" when absent.
         mask: (h, w) bool, pixels as stored, False where the picture does not count; of any size of
             the same aspect. None when all of it counts.
     """
@@ -89,6 +92,7 @@ class Photo:
     reduced: int = 1
     file_size: tuple[int, int] | None = None
     mask: NDArray[np.bool_] | None = None
+    camera_name: str = ""
 
     @property
     def width(self) -> int:
@@ -293,11 +297,20 @@ def _read(data: bytes, limits: ImageLimits, field: str) -> Photo:
             expected=f"{width} x {height} pixels of {header.format}",
             got="pixels that cannot be decoded",
         )
+    photo = Photo(
+        rgb, header.exif_orientation, focal_length_px, camera_name=_camera_name(header.exif)
+    )
     if reduced == 1:
-        return Photo(rgb, header.exif_orientation, focal_length_px)
+        return photo
     whole = np.ascontiguousarray(rgb[: height // reduced, : width // reduced])
     focal_length_px = focal_length_px and focal_length_px / reduced
-    return Photo(whole, header.exif_orientation, focal_length_px, reduced, (width, height))
+    return replace(
+        photo,
+        rgb=whole,
+        focal_length_px=focal_length_px,
+        reduced=reduced,
+        file_size=(width, height),
+    )
 
 
 def _reduction(header: PhotoHeader, limits: ImageLimits, field: str) -> int:
@@ -356,6 +369,27 @@ def _too_complex(field: str, expected: str, got: str) -> VislocError:
     return refuse("image.too_complex", field=field, expected=expected, got=got)
 
 
+def _camera_name(exif: Image.Exif) -> str:
+    """Return make and model, and the digital zoom if it was used."""
+    try:
+        make, model = (
+            exif_text(exif.get(tag)) for tag in (ExifTags.Base.Make, ExifTags.Base.Model)
+        )
+        zoom = exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.DigitalZoomRatio)
+    except MALFORMED:
+        return ""
+    zoomed = f"at digital zoom {_positive(zoom):g}" if _is_zoomed(zoom) else ""
+    return " ".join(part for part in (make, model, zoomed) if part)
+
+
+def exif_text(value: object) -> str:
+    """Return a text of EXIF as kapture can hold it; nothing for what is not a text."""
+    if not isinstance(value, str):
+        return ""
+    text = " ".join(value.replace("\0", " ").replace(",", " ").split())
+    return text if text.isprintable() else ""
+
+
 def _focal_length_px(exif: Image.Exif, width: int, height: int) -> float | None:
     try:
         tag = exif.get_ifd(ExifTags.IFD.Exif).get
@@ -365,6 +399,8 @@ def _focal_length_px(exif: Image.Exif, width: int, height: int) -> float | None:
 
 
 def _from_tags(tag: Callable[[int], object], width: int, height: int) -> float | None:
+    if _is_zoomed(tag(ExifTags.Base.DigitalZoomRatio)):
+        return None  # makers differ in whether the focal length includes it
     longer_side = max(width, height)
     equivalent_mm = _positive(tag(ExifTags.Base.FocalLengthIn35mmFilm))
     focal_length_mm = _positive(tag(ExifTags.Base.FocalLength))
@@ -384,6 +420,12 @@ def _from_tags(tag: Callable[[int], object], width: int, height: int) -> float |
         return None
     low, high = _PLAUSIBLE_FOCAL
     return focal_length_px if low <= focal_length_px / longer_side <= high else None
+
+
+def _is_zoomed(ratio: object) -> bool:
+    """Tell whether EXIF's ratio of digital zoom says that a photo is part of a larger picture."""
+    number = _positive(ratio)  # 0 or absent: not used
+    return number is not None and abs(number - 1.0) > _NO_ZOOM
 
 
 def _positive(value: object) -> float | None:

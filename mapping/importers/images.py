@@ -19,10 +19,9 @@ from mapping.methods.sparse.intrinsics import FROM_EXIF
 from visloc.errors import InvalidInput, NotFound, TooLarge, VislocError, refuse
 from visloc.file_kinds import HEAD_BYTES, FileKind, file_kind
 from visloc.geometry import Camera
-from visloc.images import FILE_LIMITS, read_exif, read_photo
+from visloc.images import FILE_LIMITS, exif_text, read_exif, read_photo
 from visloc.kapture import GnssRecord, Sensor
 from visloc.kapture.dataset import UNKNOWN_CAMERA
-from visloc.kapture.text import has_control_characters
 from visloc.photo_formats import FORMATS, SUFFIXES
 
 _GNSS = "gnss"
@@ -253,16 +252,13 @@ def _read_photo(folder: Path, name: str) -> _Found:
         raise refuse("image.unreadable", field=name, got=error.strerror) from error
     except InvalidInput as error:
         raise error.about(name, InvalidInput) from error
-    top, details, gps = _exif(data)
-    camera = " ".join(
-        _text(top.get(tag)) for tag in (ExifTags.Base.Make, ExifTags.Base.Model)
-    ).strip()
-    taken = _text(details.get(ExifTags.Base.DateTimeOriginal)) or None
+    details, gps = _exif(data)
+    taken = exif_text(details.get(ExifTags.Base.DateTimeOriginal)) or None
     if taken is not None:
-        taken += "." + _text(details.get(ExifTags.Base.SubsecTimeOriginal))
+        taken += "." + exif_text(details.get(ExifTags.Base.SubsecTimeOriginal))
     return _Found(
         name=name,
-        camera=camera,
+        camera=photo.camera_name,
         focal_length_px=photo.focal_length_px,
         width=photo.width,
         height=photo.height,
@@ -321,25 +317,13 @@ def _gnss(found: list[_Found], notes: list[str]) -> tuple[GnssRecord, ...]:
 _Tags = dict[int, object]
 
 
-def _exif(data: bytes) -> tuple[_Tags, _Tags, _Tags]:
-    """Return the tags of a photo at the top, in the Exif part and of GPS; none if broken."""
+def _exif(data: bytes) -> tuple[_Tags, _Tags]:
+    """Return the tags of a photo in the Exif part and of GPS; none if broken."""
     try:
         exif = read_exif(data)
-        return (
-            dict(exif),
-            dict(exif.get_ifd(ExifTags.IFD.Exif)),
-            dict(exif.get_ifd(ExifTags.IFD.GPSInfo)),
-        )
+        return dict(exif.get_ifd(ExifTags.IFD.Exif)), dict(exif.get_ifd(ExifTags.IFD.GPSInfo))
     except _MALFORMED:
-        return {}, {}, {}
-
-
-def _text(value: object) -> str:
-    """Return a text of EXIF as kapture can hold it; nothing for what is not a text."""
-    if not isinstance(value, str):
-        return ""
-    text = " ".join(value.replace("\0", " ").replace(",", " ").split())
-    return "" if has_control_characters(text) else text
+        return {}, {}
 
 
 def _number(value: object) -> float | None:
