@@ -197,6 +197,7 @@ class CameraSource(StrEnum):
 
     GIVEN = "given"
     GIVEN_SCALED = "given_scaled"  # given for another size of the same aspect
+    MAP = "map"  # of the map's own photos by the same camera
     EXIF = "exif"  # focal length from the photo's EXIF
     GUESS = "guess"  # nothing known: 1.2 times the longer side
     ESTIMATED = "estimated"  # nothing known: found together with the pose

@@ -27,6 +27,7 @@ from visloc.localization.acceptance.judge import TIE_ANGLE, TIE_REACH_SHARE
 from visloc.localization.geometry.constraints import MapGeometry
 from visloc.localization.geometry.viewpoints import Viewpoints
 from visloc.options import LocalizeOptions
+from visloc.pose.map_errors import PHOTO_ONLY
 
 # How many photos are tried: a fifth of the map, within these limits. The test then takes a tenth of
 # the time of a build (docs/decisions/0028-the-maps-own-test.md).
@@ -87,6 +88,7 @@ def run_own_test(
     tests.
     """
     geometry = MapGeometry(opened)
+    geometry.errors = PHOTO_ONLY  # they are what is learned, with cameras as they are
     most = min(max(_LEAST_PHOTOS, len(opened.images) // _SHARE_OF_PHOTOS), _MOST_PHOTOS)
     images = spread_photos(len(opened.images), most)
     asked = [

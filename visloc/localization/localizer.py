@@ -27,7 +27,7 @@ from visloc.localization.coarse import CoarsePoses
 from visloc.localization.geometry.constraints import Constraints, MapGeometry
 from visloc.localization.photo_answer import photo_answer
 from visloc.localization.places import solve_photo
-from visloc.localization.query.camera import query_resolution, resolve_camera
+from visloc.localization.query.camera import map_cameras, query_resolution, resolve_camera
 from visloc.localization.query.feature_cache import FeatureCache, find_features
 from visloc.localization.query.features import (
     checked_global_descriptors,
@@ -142,6 +142,7 @@ class Localizer:
                 self._descriptors[name] = descriptor
         self._named = NamedPhotos(opened)
         self.geometry = MapGeometry(opened)
+        self._map_cameras = map_cameras(opened)
         self._coarse = CoarsePoses(self.geometry)
         self.turns = (
             None if extractor is None else TurnFinder(self.geometry, extractor, self._descriptors)
@@ -267,7 +268,7 @@ class Localizer:
         if self._extractor is None or not self._takes_photos(fusion):
             raise self._features_required(fusion)
         constraints = Constraints(self.geometry, priors)
-        used, source = resolve_camera(photo, camera)
+        used, source = resolve_camera(photo, camera, self._map_cameras)
         seconds: dict[str, float] = {}
         evidence = Evidence(used, source, photo.exif_orientation, options.orientation)
         evidence = replace(evidence, turned=turned, seconds=seconds)

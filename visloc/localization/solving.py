@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 from visloc.errors import VislocError, refuse
 from visloc.geometry import Camera, Pose
 from visloc.localization.acceptance.camera_check import only_focal_length_contradicts
+from visloc.localization.acceptance.corrected_cameras import with_corrected_cameras
 from visloc.localization.acceptance.evidence import Shown
 from visloc.localization.acceptance.gates import Problem, accepted, not_better_elsewhere
 from visloc.localization.acceptance.judge import not_probable_enough
 from visloc.localization.acceptance.redraws import with_redraws
 from visloc.localization.acceptance.rivals import Proposed, stronger_place
 from visloc.localization.geometry.constraints import Constraints, MapGeometry
+from visloc.localization.query.camera import guessed_camera
 from visloc.localization.turning import REASONS_OF_TURNED_PHOTOS
 from visloc.options import LocalizeOptions, ReadAs, Solver
 from visloc.pose.centre import position_covariance, with_origin
@@ -198,6 +200,7 @@ def solve_instant(
             place, refusal, scores = stronger_place(problem, geometry, proposed, found)
             found, refusal = (place, refusal) if place is found else accepted(problem, place)
         if refusal is None and found is not None:
+            problem, found = with_corrected_cameras(problem, found)
             found, refusal = with_redraws(problem, found, geometry.reach)
         refusal = refusal and _with_turned_photos(refusal, looks)
     pose = None
@@ -205,11 +208,12 @@ def solve_instant(
         pose = measured_pose(found, found.covariance, geometry)
         pose = replace(pose, probability=found.probability)
     inliers = () if found is None else tuple(found.inliers)
-    camera = None if refusal is not None or found is None else found.camera
-    shown = with_inliers([_shown(image, camera) for image in images], inliers)
+    estimated = None if refusal is not None or found is None else found.camera
+    views = tuple(replace(view, camera=estimated or view.camera) for view in problem.views)
+    used = () if refusal is not None else views
+    shown = with_inliers(_shown(images, used, estimated is not None), inliers)
     coarse = looks[0].coarse if len(looks) == 1 else None
     answer = InstantAnswer(timestamp, shown, pose, refusal, seconds, scores, coarse)
-    views = tuple(replace(view, camera=camera or view.camera) for view in problem.views)
     solved = Solved(answer, views, found if refusal is None else None, inliers)
     refusal = not_probable_enough(answer, options)
     return solved if refusal is None else solved.refused(refusal)
@@ -276,14 +280,26 @@ def _is_guessed(look: Look) -> bool:
     return look.evidence.camera_source is CameraSource.GUESS
 
 
-def _shown(image: SeenImage, found: Camera | None) -> ImageAnswer:
-    """Return an image's evidence, with the camera that was found with the pose, unreduced."""
-    evidence = None if image.look is None else image.look.evidence
-    if image.look is not None and evidence is not None and found is not None:
-        size = evidence.camera.width, evidence.camera.height
-        stored = replace(found.reduced(1 / image.look.reduced), width=size[0], height=size[1])
-        evidence = replace(evidence, camera=stored, camera_source=CameraSource.ESTIMATED)
-    return ImageAnswer(image.sensor, image.cam_from_rig, evidence, image.error)
+def _shown(
+    images: Sequence[SeenImage], views: Sequence[MatchedView], is_estimated: bool
+) -> list[ImageAnswer]:
+    """Return each image's evidence, with the camera that its pose was found with, unreduced.
+
+    ``views`` are those of the usable images; () when there is no pose.
+    """
+    found, shown = iter(views), []
+    for image in images:
+        evidence = None if image.look is None else image.look.evidence
+        if image.look is not None and evidence is not None:
+            view, source = next(found, None), evidence.camera_source
+            if view is not None and view.camera != image.look.camera:
+                width, height = evidence.camera.width, evidence.camera.height
+                whole = view.camera.reduced(1 / image.look.reduced)
+                stored = replace(whole, width=width, height=height)
+                source = CameraSource.ESTIMATED if is_estimated else source
+                evidence = replace(evidence, camera=stored, camera_source=source)
+        shown.append(ImageAnswer(image.sensor, image.cam_from_rig, evidence, image.error))
+    return shown
 
 
 def with_inliers(
@@ -357,34 +373,45 @@ def _find_pose(
     """Return the search, its best pose or None, and the reason to refuse it or None.
 
     If a single photo contradicts the focal length of its EXIF, the search is repeated without it,
-    and finds the focal length with the pose. A given camera is a statement and is not doubted so.
-    EXIF is a hint, which editing and zooming make wrong.
+    and finds the focal length with the pose; likewise if it has no pose with a camera of the map.
+    A given camera is a statement and is not doubted so. EXIF is a hint, which editing and zooming
+    make wrong.
     """
     refusal = _nothing_to_solve(images, problem)
     if refusal is not None:
         return problem, None, refusal
     best, refusal = _judged(problem)
-    # A wrong focal length moves the pose, so that it may contradict a prior first.
-    reasons = (Reason.CAMERA_CONTRADICTED, Reason.CONTRADICTS_PRIOR)
-    if refusal is not None and refusal.reason in reasons and best is not None:
-        as_guess = _without_exif(problem, best)
-        if as_guess is not None:
-            return as_guess, *_judged(as_guess)
-    return problem, best, refusal
+    as_guess = None if refusal is None else _without_camera(problem, best, refusal.reason)
+    if as_guess is None:
+        return problem, best, refusal
+    again, still = _judged(as_guess)
+    is_hint = problem.sources == (CameraSource.MAP,)  # its refusal says less of the photo
+    return (problem, best, refusal) if is_hint and still is not None else (as_guess, again, still)
 
 
-def _without_exif(problem: Problem, pose: GeneralizedPose) -> Problem | None:
-    """Treat the focal length of EXIF as a guess, if nothing else contradicts the photo."""
-    if problem.sources != (CameraSource.EXIF,) or problem.options.solver is Solver.REGISTRATION:
+def _without_camera(
+    problem: Problem, pose: GeneralizedPose | None, reason: Reason
+) -> Problem | None:
+    """Treat the focal length of EXIF, or a camera of the map, as a guess, if it may be wrong."""
+    if problem.options.solver is Solver.REGISTRATION or len(problem.views) != 1:
         return None
-    (view,) = problem.views
-    # The gate may have found these intrinsics already. Finding them again takes little, compared
-    # with the second search, which only such photos get.
-    if not only_focal_length_contradicts(
-        view, CameraSource.EXIF, pose.rig_from_world, problem.registration.max_error_px
+    (view,), (source,) = problem.views, problem.sources
+    camera = view.camera
+    if source is CameraSource.MAP:
+        camera = guessed_camera(camera.width, camera.height)
+    # A wrong focal length moves the pose, so that it may contradict a prior first. The gate may
+    # have found these intrinsics already. Finding them again takes little, compared with the
+    # second search, which only such photos get.
+    elif (
+        source is not CameraSource.EXIF
+        or pose is None
+        or reason not in (Reason.CAMERA_CONTRADICTED, Reason.CONTRADICTS_PRIOR)
+        or not only_focal_length_contradicts(
+            view, source, pose.rig_from_world, problem.registration.max_error_px
+        )
     ):
         return None
-    views = (replace(view, focal_unknown=True),)
+    views = (replace(view, camera=camera, focal_unknown=True),)
     return replace(problem, views=views, sources=(CameraSource.GUESS,))
 
 

@@ -1409,7 +1409,7 @@ class CameraUsed(_message.Message):
     width: _builtins.int
     height: _builtins.int
     source: _builtins.str
-    """given, given_scaled, exif, estimated (with the pose) or guess"""
+    """given, given_scaled, map, exif, estimated (with the pose) or guess"""
     @_builtins.property
     def params(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]: ...
     def __init__(

@@ -103,8 +103,9 @@ class CameraUsed(Answer):
         OneOf(visloc.types.CameraSource),
         Field(
             description="given: as sent; given_scaled: as sent, for another size of the same "
-            "aspect; exif: focal length from EXIF; estimated: focal length solved with "
-            "the pose; guess: focal length 1.2 times the longer side"
+            "aspect; map: of the map's photos by the same camera; exif: focal length from EXIF; "
+            "estimated: focal length solved with the pose; guess: focal length 1.2 times the "
+            "longer side. In all but the last, with what the photo showed to be off corrected"
         ),
     ]
 

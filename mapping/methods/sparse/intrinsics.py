@@ -71,6 +71,7 @@ class CameraOrigin(BaseModel):
 
     Attributes:
         source: ``exif``, ``given`` (by the dataset), or ``estimated`` from the photos alone.
+        name: make and model by EXIF; "" if the dataset gave the camera.
         prior_px: the focal length of EXIF or the dataset; None if estimated.
         doubt: why the prior was kept; if estimated, why it may be far off.
         refined_px: the refined value of a camera in doubt; None if it is not finite.
@@ -79,6 +80,7 @@ class CameraOrigin(BaseModel):
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
 
     source: Literal["exif", "given", "estimated"]
+    name: str = ""
     prior_px: float | None = None
     doubt: Reason | None = None
     refined_px: float | None = None
@@ -87,10 +89,11 @@ class CameraOrigin(BaseModel):
 def origin_of(sensor: Sensor, doubt: Doubt | None) -> CameraOrigin:
     """Return the source of the focal length of a dataset's camera, and why it is in doubt."""
     refined = None if doubt is None else doubt.focal_length_px
+    from_exif = sensor.name.endswith(FROM_EXIF)
+    known = sensor.camera is not None
     return CameraOrigin(
-        source="estimated"
-        if sensor.camera is None
-        else ("exif" if sensor.name.endswith(FROM_EXIF) else "given"),
+        source="exif" if known and from_exif else ("given" if known else "estimated"),
+        name="" if known and not from_exif else sensor.name.removesuffix(FROM_EXIF).strip(),
         prior_px=None if sensor.camera is None else sensor.camera.focal_length,
         doubt=None if doubt is None else doubt.reason,
         refined_px=refined if refined is not None and math.isfinite(refined) else None,

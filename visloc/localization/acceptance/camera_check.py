@@ -44,6 +44,7 @@ _MIN_INLIERS = 30
 _SUBJECTS: Mapping[CameraSource, str] = {
     CameraSource.GIVEN: "the given camera",
     CameraSource.GIVEN_SCALED: "the given camera, scaled to the photo,",
+    CameraSource.MAP: "the camera of the map's photos",
     CameraSource.EXIF: "the camera from EXIF",
     CameraSource.ESTIMATED: "the camera found with the pose",
 }
@@ -51,6 +52,7 @@ _SEND_THE_RIGHT_ONE = "send the camera of these pixels"
 _ADVICE: Mapping[CameraSource, str] = {
     CameraSource.GIVEN: "correct the camera, or send none",
     CameraSource.GIVEN_SCALED: "correct the camera, or send none",
+    CameraSource.MAP: _SEND_THE_RIGHT_ONE,
     CameraSource.EXIF: _SEND_THE_RIGHT_ONE,
     CameraSource.ESTIMATED: _SEND_THE_RIGHT_ONE,
 }

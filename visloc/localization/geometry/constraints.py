@@ -113,7 +113,7 @@ class MapGeometry:
             raise AssertionError("the landmarks of this map were made of all its photos")
         geometry = MapGeometry(self.opened)
         geometry._local = self._local.without(photos)
-        geometry.reach = self.reach
+        geometry.reach, geometry.errors = self.reach, self.errors
         return geometry
 
     def nearest_photos(self, row: int, count: int) -> NDArray[np.int64]:

@@ -1,7 +1,12 @@
-"""The intrinsics of a query: given, from EXIF, or guessed."""
+"""The intrinsics of a query: given, of the map's own photos, from EXIF, or guessed."""
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from visloc.archive import Map
 from visloc.errors import refuse
 from visloc.features.resolution import Resolution
 from visloc.geometry import Camera
@@ -13,13 +18,71 @@ from visloc.types import CameraSource
 GUESSED_FOCAL = 1.2
 
 
+# EXIF's focal lengths of one lens differ by rounding, and by how far away it is focused.
+_SAME_FOCAL = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class MapCamera:
+    """A camera of a map's photos.
+
+    Attributes:
+        camera: as the map has it.
+        name: make and model; "" when unknown.
+        exif_px: focal length by EXIF, in pixels; None without.
+    """
+
+    camera: Camera
+    name: str
+    exif_px: float | None
+
+    def took(self, photo: Photo) -> bool:
+        """Tell whether the camera seems to have taken a photo: by its size, make, model and lens.
+
+        A photo without any of these may be of any camera of its size.
+        """
+        size = photo.file_size or (photo.width, photo.height)
+        if (self.camera.width, self.camera.height) != size or self.name != photo.camera_name:
+            return False
+        if self.exif_px is None or photo.focal_length_px is None:
+            return self.exif_px is photo.focal_length_px
+        return abs(photo.focal_length_px * photo.reduced / self.exif_px - 1) <= _SAME_FOCAL
+
+
+def map_cameras(opened: Map) -> tuple[MapCamera, ...]:
+    """Return the cameras of a map's photos, those of most photos first."""
+    origins = opened.manifest.method.settings.get("cameras")
+    found = []
+    for sensor, _ in Counter(image.camera for image in opened.images).most_common():
+        origin = origins.get(sensor) if isinstance(origins, dict) else None
+        told = origin if isinstance(origin, dict) else {}
+        name, prior = told.get("name"), told.get("prior_px")
+        exif_px = (
+            float(prior) if told.get("source") == "exif" and isinstance(prior, float) else None
+        )
+        camera = opened.cameras[sensor]
+        found.append(MapCamera(camera, name if isinstance(name, str) else "", exif_px))
+    return tuple(found)
+
+
+def guessed_camera(width: int, height: int) -> Camera:
+    """Return a camera of which nothing is known."""
+    focal = GUESSED_FOCAL * max(width, height)
+    return Camera("SIMPLE_PINHOLE", width, height, (focal, width / 2, height / 2))
+
+
 def query_resolution(camera: Camera, source: CameraSource) -> Resolution:
     """Return how finely a photo sees, by its width where the focal length is a guess."""
     return Resolution.of(camera, known=source is not CameraSource.GUESS)
 
 
-def resolve_camera(photo: Photo, given: Camera | None) -> tuple[Camera, CameraSource]:
-    """Choose the intrinsics of a photo: given, else EXIF's focal length, else a guess.
+def resolve_camera(
+    photo: Photo, given: Camera | None, mapped: Sequence[MapCamera] = ()
+) -> tuple[Camera, CameraSource]:
+    """Choose the intrinsics of a photo.
+
+    Those given, else those of the map's camera that took it, else EXIF's focal length, else a
+    guess.
 
     A camera given for another size of the same aspect is scaled to the photo; that of a photo that
     was reduced while it was decoded is reduced with it. For a photo on its
@@ -30,10 +93,13 @@ def resolve_camera(photo: Photo, given: Camera | None) -> tuple[Camera, CameraSo
     """
     width, height = photo.width, photo.height
     if given is None:
-        known = photo.focal_length_px is not None
-        focal = photo.focal_length_px or GUESSED_FOCAL * max(width, height)
-        camera = Camera("SIMPLE_PINHOLE", width, height, (focal, width / 2, height / 2))
-        return camera, CameraSource.EXIF if known else CameraSource.GUESS
+        of_map = next((one.camera for one in mapped if one.took(photo)), None)
+        if of_map is not None:
+            return of_map.reduced(photo.reduced), CameraSource.MAP
+        if photo.focal_length_px is None:
+            return guessed_camera(width, height), CameraSource.GUESS
+        params = photo.focal_length_px, width / 2, height / 2
+        return Camera("SIMPLE_PINHOLE", width, height, params), CameraSource.EXIF
     if (given.width, given.height) == (width, height):
         return given, CameraSource.GIVEN
     if (given.width, given.height) == photo.file_size:

@@ -146,7 +146,7 @@ export interface Refusal {
 
 /** The intrinsics that were used, and where they came from. */
 export type CameraUsed = Camera & {
-  source: "given" | "given_scaled" | "exif" | "estimated" | "guess";
+  source: "given" | "given_scaled" | "map" | "exif" | "estimated" | "guess";
 };
 
 /** A mapping photo that was matched with. */

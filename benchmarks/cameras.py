@@ -1,0 +1,363 @@
+"""Queries whose camera is not quite right: error, and error over stated deviation.
+
+    python -m benchmarks.cameras exif given shutter zoom exact
+    python -m benchmarks.cameras held-out --data ../shared/data
+
+``exif``: queries of the sample with EXIF's focal length in whole millimetres (24.75 is true);
+``given``: with the sample's camera changed; ``shutter``: taken while the camera moves, rows read
+within 20 ms; ``zoom``: the middle quarter, with EXIF that tells the zoom beside the focal length
+without it; ``exact``: right cameras of several sets. ``held-out``: maps of photos alone without
+every fifth photo, which is asked without intrinsics, and with the map's camera. Maps are those of
+``make trust``; missing ones are built.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated
+
+import cv2
+import numpy as np
+import typer
+from numpy.typing import NDArray
+from PIL import ExifTags, Image
+from scipy.special import chdtri
+
+from benchmarks.trust.maps import SAMPLE, Places, make_missing
+from mapping.build.build import build_map
+from mapping.build.settings import BuildSettings
+from mapping.frames.anchor import align_poses
+from mapping.importers import read_model
+from mapping.importers.dataset import write_imported
+from mapping.methods.sfm_settings import SfmSettings
+from samples.render import render_photo
+from samples.scene import make_room
+from visloc.archive import Map, MapStore
+from visloc.features import make_global_descriptor, make_local_features
+from visloc.geometry import Camera, PixelOrigin, Pose, Similarity, rotation_angle
+from visloc.images import read_photo_file
+from visloc.kapture import Dataset, FileRecord, read_dataset
+from visloc.localization.localizer import Localizer
+from visloc.options import LocalizeOptions
+from visloc.pose.centre import position_covariance
+from visloc.types import Localized
+
+QUERIES, ROWS_MS, BANDS = 10, 20.0, 24
+EXACT = (SAMPLE, "castle", "kitti_curve", "virtual_gallery", "redkitchen")
+HELD_OUT = ("castle", "lund_door", "sample", "drone_beach")
+# Of the spread of the photos, and degrees.
+RIGHT_SHARE, RIGHT_DEG = 0.02, 2.0
+Make = Callable[[NDArray[np.uint8], Camera], tuple[NDArray[np.uint8], Camera]]
+
+
+def localizer_of(opened: Map) -> Localizer:
+    """Return what localizes photos in a map, in this process."""
+    name = opened.manifest.local_features.fingerprint.name
+    return Localizer(
+        opened, make_local_features(name, None), partial(make_global_descriptor, weights_dir=None)
+    )
+
+
+class Row:
+    """The answers to some queries, printed as a row of the table."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.asked = 0
+        self.found: list[tuple[float, float, bool]] = []
+        self.sources: Counter[str] = Counter()
+
+    def ask(self, localizer: Localizer, path: Path, camera: Camera | None, truth: Pose) -> None:
+        """Ask one query, and compare with the truth."""
+        self.asked += 1
+        answer = localizer.localize(read_photo_file(path), camera, LocalizeOptions())
+        self.sources[str(answer.evidence.camera_source)] += 1
+        if not isinstance(answer, Localized):
+            return
+        error = answer.cam_from_world.center - truth.center
+        stated = position_covariance(answer.cam_from_world, answer.covariance)
+        inside = bool(error @ np.linalg.solve(stated, error) <= chdtri(3, 0.05))
+        off = float(np.linalg.norm(error))
+        self.found.append((off, off / float(np.sqrt(np.trace(stated))), inside))
+
+    def print(self) -> None:
+        """Print it."""
+        off, ratio, inside = np.array(self.found, np.float64).reshape(-1, 3).T
+        sources = ", ".join(self.sources)
+        typer.echo(
+            f"| {self.name} | {sources} | {len(off)} of {self.asked} | "
+            f"{100 * np.median(off):.2f} | {100 * off.max(initial=0):.1f} | "
+            f"{np.median(ratio):.1f} | {inside.mean():.0%} |"
+            if len(off)
+            else f"| {self.name} | {sources} | 0 of {self.asked} | | | | |"
+        )
+
+
+def _queries(places: Places) -> Iterator[tuple[Path, Camera, Pose]]:
+    dataset = read_dataset(places.dataset(SAMPLE, "query"))
+    taken = [record for record in dataset.images if record.sensor_id == "left"]
+    for record in taken[:QUERIES]:
+        camera, pose = dataset.sensors[record.sensor_id].camera, dataset.pose(record)
+        assert camera is not None
+        assert pose is not None
+        yield dataset.path_of(record), camera, pose
+
+
+def _with_exif(source: Image.Image, path: Path, **tags: float) -> None:
+    exif = Image.Exif()
+    exif[ExifTags.Base.Make], exif[ExifTags.Base.Model] = "Maker", "Phone"
+    details = exif.get_ifd(ExifTags.IFD.Exif)
+    for name, value in tags.items():
+        details[ExifTags.Base[name]] = value
+    source.save(path, exif=exif, quality=97, subsampling=0)
+
+
+def exif(places: Places, scratch: Path) -> Iterator[Row]:
+    """EXIF's focal length in whole millimetres, and none."""
+    localizer = localizer_of(places.store.open(SAMPLE))
+    for millimetres in (None, 24, 25, 26):
+        row = Row("no EXIF" if millimetres is None else f"EXIF {millimetres} mm")
+        for source, _, truth in _queries(places):
+            tags = {} if millimetres is None else {"FocalLengthIn35mmFilm": millimetres}
+            _with_exif(Image.open(source), scratch / "photo.jpg", **tags)
+            row.ask(localizer, scratch / "photo.jpg", None, truth)
+        yield row
+
+
+def zoom(places: Places, scratch: Path) -> Iterator[Row]:
+    """Twofold digital zoom, which EXIF's focal length contains or not."""
+    localizer = localizer_of(places.store.open(SAMPLE))
+    for millimetres in (25, 50):
+        row = Row(f"digital zoom of 2, EXIF {millimetres} mm")
+        for source, camera, truth in _queries(places):
+            w, h = camera.width, camera.height
+            photo = Image.open(source)
+            middle = photo.crop((w // 4, h // 4, 3 * w // 4, 3 * h // 4)).resize((w, h))
+            tags = {"FocalLengthIn35mmFilm": millimetres, "DigitalZoomRatio": 2.0}
+            _with_exif(middle, scratch / "photo.jpg", **tags)
+            row.ask(localizer, scratch / "photo.jpg", None, truth)
+        yield row
+
+
+def _changed(camera: Camera, zoom: float = 1.0, shift: float = 0.0) -> Camera:
+    fx, fy, cx, cy = camera.params
+    return replace(camera, params=(zoom * fx, zoom * fy, cx + shift, cy + shift))
+
+
+def _with_k1(camera: Camera, k1: float) -> Camera:
+    params = (*camera.params, k1, 0.0, 0.0, 0.0)
+    return Camera("OPENCV", camera.width, camera.height, params)
+
+
+def _distorted(rgb: NDArray[np.uint8], camera: Camera, k1: float) -> NDArray[np.uint8]:
+    """Return the pixels of a lens with a distortion."""
+    fx, fy, cx, cy = camera.params
+    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    pixels = np.stack([u.ravel(), v.ravel()], 1).reshape(-1, 1, 2)
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    rays = cv2.undistortPoints(pixels, matrix, np.array([k1, 0.0, 0.0, 0.0])).reshape(-1, 2)
+    where = (rays * (fx, fy) + (cx - 0.5, cy - 0.5)).astype(np.float32)
+    where = where.reshape(camera.height, camera.width, 2)
+    found = cv2.remap(
+        rgb, where[..., 0], where[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT
+    )
+    return np.asarray(found, np.uint8)
+
+
+def _sent(
+    rgb: NDArray[np.uint8], camera: Camera, *, zoom: float = 1.0, shift: float = 0.0
+) -> tuple[NDArray[np.uint8], Camera]:
+    return rgb, _changed(camera, zoom, shift)
+
+
+CHANGES: dict[str, Make] = {
+    "right": _sent,
+    **{
+        f"focal length {100 * (zoom - 1):+.0f} %": partial(_sent, zoom=zoom)
+        for zoom in (0.99, 1.01, 0.98, 1.02, 0.96, 1.04)
+    },
+    **{f"principal point {px} px": partial(_sent, shift=px) for px in (3, 6, 12)},
+    "k1 -0.05 sent for rectified": lambda rgb, c: (rgb, _with_k1(c, -0.05)),
+    "k1 -0.05 forgotten": lambda rgb, c: (_distorted(rgb, c, -0.05), c),
+}
+
+
+def given(places: Places, scratch: Path) -> Iterator[Row]:
+    """Cameras that the caller sends, not quite those of the pixels."""
+    localizer = localizer_of(places.store.open(SAMPLE))
+    for name, make in CHANGES.items():
+        row = Row(name)
+        for source, camera, truth in _queries(places):
+            rgb, sent = make(read_photo_file(source).rgb, camera)
+            Image.fromarray(rgb).save(scratch / "photo.png")
+            row.ask(localizer, scratch / "photo.png", sent, truth)
+        yield row
+
+
+# Degrees per second to the right, metres per second to the right and ahead.
+MOTIONS = {
+    "still": (0, 0, 0),
+    "walking aside, 1.4 m/s": (0, 1.4, 0),
+    "turning, 30 degrees/s": (30, 0, 0),
+    "turning, 90 degrees/s": (90, 0, 0),
+    "ahead, 5 m/s": (0, 0, 5),
+}
+
+
+def shutter(places: Places, scratch: Path) -> Iterator[Row]:
+    """Rows that are read while the camera moves."""
+    localizer, room = localizer_of(places.store.open(SAMPLE)), make_room(0)
+    for name, (turn, aside, ahead) in MOTIONS.items():
+        row = Row(f"20 ms, {name}")
+        for _, camera, truth in _queries(places):
+            rgb, height = np.zeros((camera.height, camera.width, 3), np.uint8), camera.height
+            for band in range(BANDS):
+                seconds = ((band + 0.5) / BANDS - 0.5) * ROWS_MS / 1000
+                angle = np.radians(turn * seconds)
+                cos, sin = np.cos(angle), np.sin(angle)
+                turned = np.array([[cos, 0, -sin], [0, 1, 0], [sin, 0, cos]]) @ truth.rotation
+                center = truth.center + seconds * truth.rotation.T @ (aside, 0.0, ahead)
+                rows = slice(band * height // BANDS, (band + 1) * height // BANDS)
+                rgb[rows] = render_photo(room, camera, Pose(turned, -turned @ center))[rows]
+            Image.fromarray(rgb).save(scratch / "photo.png")
+            row.ask(localizer, scratch / "photo.png", camera, truth)
+        yield row
+
+
+def exact(places: Places, _: Path) -> Iterator[Row]:
+    """Right cameras."""
+    for name in EXACT:
+        localizer, row = localizer_of(places.store.open(name)), Row(name)
+        dataset = read_dataset(places.dataset(name, "query"))
+        if name == "virtual_gallery":
+            dataset = dataset.with_pixels_from(PixelOrigin.CENTER)
+        for record in dataset.images:
+            camera, pose = dataset.sensors[record.sensor_id].camera, dataset.pose(record)
+            if pose is not None:
+                row.ask(localizer, dataset.path_of(record), camera, pose)
+        yield row
+
+
+TABLES: dict[str, Callable[[Places, Path], Iterator[Row]]] = {
+    "exif": exif,
+    "given": given,
+    "shutter": shutter,
+    "zoom": zoom,
+    "exact": exact,
+}
+
+
+def _photos_alone(name: str, places: Places) -> tuple[list[Path], dict[str, Pose]]:
+    """Return the photos of a set, and the poses known of them by file name."""
+    if name == "lund_door":
+        model = read_model("colmap", places.data / "import_samples" / "lund_door")
+        assert model.photos is not None
+        poses = {Path(i.name).name: p for i in model.images if (p := i.cam_from_world) is not None}
+        return [model.photos / image.name for image in model.images], poses
+    dataset = read_dataset(places.dataset(name, "mapping"))
+    records: Sequence[FileRecord] = dataset.images
+    return [dataset.path_of(r) for r in records], _poses(dataset)
+
+
+def _poses(dataset: Dataset) -> dict[str, Pose]:
+    """Return the poses of a dataset's photos by the ends of their paths."""
+    found = {}
+    for record in dataset.images:
+        pose = dataset.pose(record)
+        if pose is not None:
+            found[record.path.replace("/", "_")] = pose
+    return found
+
+
+def held_out(places: Places, scratch: Path) -> None:
+    """Build maps without every fifth photo, and ask for that."""
+    for name in HELD_OUT:
+        photos, truth = _photos_alone(name, places)
+        names = [str(path).rsplit("records_data/", 1)[-1].replace("/", "_") for path in photos]
+        if name == "lund_door":
+            names = [path.name for path in photos]
+        folder, maps = scratch / name / "photos", scratch / name / "maps"
+        folder.mkdir(parents=True)
+        for number, (path, new) in enumerate(zip(photos, names, strict=True)):
+            if number % 5:
+                shutil.copy(path, folder / new)
+        write_imported(read_model("images", folder), scratch / name / "dataset")
+        sfm = SfmSettings(poses="estimate", refine=("intrinsics",))
+        settings = BuildSettings(
+            scratch / name / "dataset", name, maps_dir=maps, method="sfm", sfm=sfm, workers=2
+        )
+        build_map(replace(settings, accept=True), lambda *_: None)
+        opened = MapStore(maps).open(name)
+        in_map = {
+            Path(image.name).name: Pose.from_quaternion(row[:4], row[4:])
+            for image, row in zip(opened.images, opened.image_poses, strict=True)
+        }
+        both = [each for each in in_map if each in truth]
+        if len(both) < 3:
+            typer.echo(f"| {name} | {len(in_map)} | no truth | | | |")
+            continue
+        to_truth = align_poses([in_map[each] for each in both], [truth[each] for each in both])
+        centers = np.array([truth[each].center for each in both])
+        spread = float(np.linalg.norm(centers - np.median(centers, axis=0), axis=1).max())
+        camera = next(iter(opened.cameras.values()))
+        localizer, told = localizer_of(opened), []
+        for sent in (None, camera):
+            counts: Counter[str] = Counter()
+            for path, new in list(zip(photos, names, strict=True))[::5]:
+                if new in truth:
+                    counts[_rightness(localizer, path, sent, truth[new], to_truth, spread)] += 1
+            told.append(", ".join(f"{count} {what}" for what, count in counts.items()))
+        typer.echo(
+            f"| {name} | {len(in_map)} of {len(list(folder.iterdir()))} | {told[0]} | {told[1]} |"
+        )
+
+
+def _rightness(
+    localizer: Localizer,
+    path: Path,
+    sent: Camera | None,
+    truth: Pose,
+    to_truth: Similarity,
+    spread: float,
+) -> str:
+    answer = localizer.localize(read_photo_file(path), sent, LocalizeOptions())
+    if not isinstance(answer, Localized):
+        return "refused"
+    there = to_truth.move(answer.cam_from_world)
+    off = float(np.linalg.norm(there.center - truth.center)) / spread
+    turned = np.degrees(rotation_angle(there.rotation @ truth.rotation.T))
+    return "right" if off <= RIGHT_SHARE and turned <= RIGHT_DEG else f"wrong by {off:.1%}"
+
+
+def main(
+    tables: Annotated[list[str], typer.Argument(help=f"Of {', '.join(TABLES)}, held-out.")],
+    data: Annotated[Path, typer.Option(help="The shared data sets.")] = Path("../shared/data"),
+    maps: Annotated[Path, typer.Option(help="A store of maps.")] = Path(".trust/maps"),
+) -> None:
+    """Ask, and print tables in Markdown."""
+    places = Places(data, maps)
+    needed = set(EXACT) if "exact" in tables else {SAMPLE}
+    make_missing(places, needed, lambda line: typer.echo(line, err=True))
+    with TemporaryDirectory() as scratch:
+        for table in tables:
+            if table == "held-out":
+                typer.echo("\n| photos | placed | without intrinsics | with the map's camera |")
+                typer.echo("|---|---|---|---|")
+                held_out(places, Path(scratch))
+                continue
+            typer.echo(
+                "\n| queries | camera | answered | median error, cm | largest | error / stated "
+                "deviation | truths inside 95 % |\n|---|---|---|---|---|---|---|"
+            )
+            for row in TABLES[table](places, Path(scratch)):
+                row.print()
+
+
+if __name__ == "__main__":
+    typer.run(main)

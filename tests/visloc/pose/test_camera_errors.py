@@ -1,0 +1,169 @@
+"""Cameras that are off in one part, in exact scenes: what is corrected, and what is carried."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from visloc.geometry import Camera, Pose
+from visloc.pose.camera_errors import PRIORS, CameraErrors, find_camera_errors
+from visloc.pose.centre import position_covariance
+from visloc.pose.colmap import project
+from visloc.pose.generalized import refine_generalized_pose
+from visloc.pose.motion import moved
+from visloc.pose.views import MatchedView
+from visloc.types import CameraSource
+
+TRUE = Camera("PINHOLE", 640, 480, (460.0, 460.0, 322.0, 238.0))
+POSE = Pose.from_quaternion(np.array([0.98, 0.05, 0.18, -0.03]), np.array([0.3, -0.2, 0.5]))
+GIVEN = PRIORS[CameraSource.GIVEN]
+NOISE_PX, MAX_ERROR_PX = 0.4, 12.0
+# A turn and a walk while the rows are read.
+MOTION = np.array([0.0, 0.01, 0.0, 0.03, 0.0, 0.0])
+
+
+def seen(
+    seed: int,
+    taken: Camera = TRUE,
+    told: Camera = TRUE,
+    motion: NDArray[np.float64] | None = None,
+    depth: tuple[float, float] = (2.0, 6.0),
+) -> MatchedView:
+    """What a camera ``taken`` sees of points in all depths, with the camera that is ``told``."""
+    random = np.random.default_rng(seed)
+    pixels = random.uniform((0, 0), (640, 480), (900, 2))
+    rays = (pixels - (322, 238)) / 460
+    along = random.uniform(*depth, 900)
+    in_cam = np.column_stack([rays, np.ones(900)]) * along[:, None]
+    points = POSE.inverse().apply(in_cam)
+    exact = project(taken, in_cam)
+    if motion is not None:
+        rows = exact[:, 1] / 480 - 0.5
+        later = [
+            moved(POSE, row * motion).apply(x[None])[0] for row, x in zip(rows, points, strict=True)
+        ]
+        exact = project(taken, np.array(later))
+    return MatchedView(told, Pose.identity(), exact + random.normal(0, NOISE_PX, (900, 2)), points)
+
+
+def found_in(view: MatchedView, factor: float = 1.0) -> CameraErrors:
+    best = refine_generalized_pose([view], POSE, max_error_px=MAX_ERROR_PX)
+    assert best is not None
+    found = find_camera_errors(
+        [view], [GIVEN], best.rig_from_world, max_error_px=MAX_ERROR_PX, factor=factor
+    )
+    assert found is not None
+    return found
+
+
+def changed(**parts: float) -> Camera:
+    names = ("fx", "fy", "cx", "cy", "k1")
+    values = dict(zip(names, (*TRUE.params, 0.0), strict=True))
+    values |= {name: values[name] + by for name, by in parts.items()}
+    return Camera("OPENCV", 640, 480, (*(values[name] for name in names), 0.0, 0.0, 0.0))
+
+
+WRONG = {
+    "focal length 2 % too long": changed(fx=9.2, fy=9.2),
+    "focal length 4 % too short": changed(fx=-18.4, fy=-18.4),
+    "principal point 6 px off": changed(cx=6, cy=-6),
+    "distortion of rectified pixels": changed(k1=-0.05),
+}
+
+
+@pytest.mark.parametrize("told", WRONG.values(), ids=WRONG.keys())
+def test_wrong_part_of_a_given_camera_is_corrected(told: Camera) -> None:
+    found = found_in(seen(0, told=told))
+    assert found.corrected
+    best = refine_generalized_pose(found.views, found.rig_from_world, max_error_px=MAX_ERROR_PX)
+    assert best is not None
+    assert np.linalg.norm(best.rig_from_world.center - POSE.center) < 0.01
+    camera = dict(zip(("fx", "fy", "cx", "cy", "k1"), found.views[0].camera.params, strict=False))
+    assert camera["fx"] == pytest.approx(460, rel=0.005)
+    assert (camera["cx"], camera["cy"]) == pytest.approx((322, 238), abs=1.5)
+    assert camera["k1"] == pytest.approx(0, abs=0.01)
+
+
+def test_motion_while_rows_are_read_is_corrected() -> None:
+    view = seen(0, motion=MOTION)
+    before = refine_generalized_pose([view], POSE, max_error_px=MAX_ERROR_PX)
+    found = found_in(view)
+    best = refine_generalized_pose(found.views, found.rig_from_world, max_error_px=MAX_ERROR_PX)
+    assert before is not None
+    assert best is not None
+    off = [np.linalg.norm(pose.rig_from_world.center - POSE.center) for pose in (before, best)]
+    assert off[1] < 0.003 < off[0]
+    assert found.views[0].camera == TRUE
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_right_camera_stays_to_the_last_bit(seed: int) -> None:
+    view = seen(seed)
+    found = found_in(view)
+    assert not found.corrected
+    assert found.views == (view,)
+
+
+def test_errors_that_the_landmarks_share_take_the_say_from_the_photo() -> None:
+    view = seen(0, told=WRONG["focal length 2 % too long"])
+    assert found_in(view).corrected
+    assert not found_in(view, factor=200.0).corrected
+
+
+def test_wall_parallel_to_the_picture_does_not_tell_the_focal_length() -> None:
+    view = seen(0, told=WRONG["focal length 2 % too long"], depth=(4.0, 4.02))
+    found = found_in(view)
+    stated = position_covariance(found.rig_from_world, found.of_camera)
+    off = np.linalg.norm(found.rig_from_world.center - POSE.center)
+    assert not found.corrected or off <= 3 * np.sqrt(np.trace(stated))
+
+
+def test_stated_part_of_the_camera_covers_what_is_left() -> None:
+    inside = 0
+    for seed in range(20):
+        view = seen(seed, told=WRONG["focal length 2 % too long"])
+        found = found_in(view)
+        best = refine_generalized_pose(found.views, found.rig_from_world, max_error_px=MAX_ERROR_PX)
+        assert best is not None
+        assert best.covariance is not None
+        whole = position_covariance(best.rig_from_world, best.covariance + found.of_camera)
+        error = best.rig_from_world.center - POSE.center
+        inside += error @ np.linalg.solve(whole, error) <= 7.81  # 95 % of chi-square with three
+    assert inside >= 17
+
+
+def test_wrong_camera_of_a_rig_leaves_the_other_alone() -> None:
+    right, wrong = seen(0), seen(1, told=WRONG["principal point 6 px off"])
+    found = find_camera_errors(
+        [right, wrong], [GIVEN, GIVEN], POSE, max_error_px=MAX_ERROR_PX, factor=1.0
+    )
+    assert found is not None
+    assert found.views[0].camera.params[:4] == pytest.approx(TRUE.params, abs=0.3)
+    assert found.views[1].camera.params[2:4] == pytest.approx((322, 238), abs=0.5)
+
+
+def test_views_without_matches_stay_as_they_are() -> None:
+    none = seen(0).selected(np.zeros(900, bool))
+    found = find_camera_errors(
+        [none, seen(1)], [GIVEN, GIVEN], POSE, max_error_px=MAX_ERROR_PX, factor=1.0
+    )
+    assert found is not None
+    assert found.views[0] is none
+
+
+@pytest.mark.parametrize("rows", [0, 10])
+def test_few_matches_tell_nothing(rows: int) -> None:
+    few = seen(0).selected(np.arange(rows))
+    assert find_camera_errors([few], [GIVEN], POSE, max_error_px=12.0, factor=1.0) is None
+
+
+def test_fisheye_keeps_its_distortion() -> None:
+    fisheye = Camera("OPENCV_FISHEYE", 640, 480, (*TRUE.params, 0.02, 0.0, 0.0, 0.0))
+    longer = replace(fisheye, params=(469.2, 469.2, *fisheye.params[2:]))
+    found = found_in(seen(0, taken=fisheye, told=longer))
+    assert found.corrected
+    assert found.views[0].camera.params[4:] == fisheye.params[4:]
+    assert found.views[0].camera.params[0] == pytest.approx(460, rel=0.005)
