@@ -32,8 +32,8 @@ from visloc.photo_formats import (
 )
 
 Pixel = TypeVar("Pixel", bound=np.generic)
-# EXIF's focal length is hardly better than such a zoom.
-_NO_ZOOM = 0.02
+# A smaller zoom changes the focal length by less than EXIF's rounding.
+_ZOOM_TOLERANCE = 0.02
 # CIPA DCG-001: the 35 mm equivalent compares diagonals; that of a 36 mm x 24 mm frame.
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF FocalPlaneResolutionUnit
@@ -425,7 +425,7 @@ def _from_tags(tag: Callable[[int], object], width: int, height: int) -> float |
 def _is_zoomed(ratio: object) -> bool:
     """Tell whether EXIF's ratio of digital zoom says that a photo is part of a larger picture."""
     number = _positive(ratio)  # 0 or absent: not used
-    return number is not None and abs(number - 1.0) > _NO_ZOOM
+    return number is not None and abs(number - 1.0) > _ZOOM_TOLERANCE
 
 
 def _positive(value: object) -> float | None:

@@ -290,7 +290,7 @@ class Localized:
         inlier_keypoints: (N, 2) float32 pixels of the photo as stored.
         inlier_points: (N, 3) float64 in the world.
         photo_covariance: (6, 6) float64, the photo's part of ``covariance``: what the scatter of
-            its own measurements leaves open.
+            its own measurements and the errors of its camera leave open.
         uncertainty: what ``covariance`` covers.
         probability: that the pose is right, 0 to 1 (docs/decisions/0029-evidence-against.md); None
             when the photo's features were not compared with the map around the pose.
@@ -414,7 +414,8 @@ class RigPose:
         orientation_std: (3,) standard deviations of w (rad), about the rig's x, y, z.
         source: ESTIMATED when the instant's own images measured it.
         photo_covariance: (6, 6) float64, the part of ``covariance`` that the scatter of the
-            instant's own images leaves open; None for a pose that they did not measure.
+            instant's own images and the errors of their cameras leave open; None for a pose that
+            they did not measure.
         uncertainty: what ``covariance`` covers.
         probability: that the pose is right, 0 to 1, judged by the instant's own images; None when
             they did not measure it, or only with the help of other instants.

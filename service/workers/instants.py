@@ -15,7 +15,7 @@ from visloc.geometry import Pose
 from visloc.images import Photo
 from visloc.localization.geometry.constraints import Constraints
 from visloc.localization.localizer import Localizer
-from visloc.localization.query.camera import resolve_camera
+from visloc.localization.query.camera import MapCamera, resolve_camera
 from visloc.localization.solving import Look, SeenImage
 from visloc.options import LocalizeOptions
 from visloc.priors import Priors
@@ -70,7 +70,9 @@ class Target:
             if isinstance(query, QueryFeatures):
                 look = self.localizer.look_at_features(query, camera, options, priors)
             else:
-                look = self.localizer.look(query, camera, options, priors, decoded.found, turned)
+                look = self.localizer.look(
+                    query, camera, options, priors, decoded.found, turned, alone=len(self.rig) == 1
+                )
         except InvalidInput as error:
             if error.code.startswith(_OF_ALL_IMAGES):
                 raise
@@ -86,11 +88,13 @@ class Target:
         return priors.maps is None or not {opened.manifest.id, opened.ref}.isdisjoint(priors.maps)
 
 
-def refused_before(job: RigJob, photo: Photo, seconds: Mapping[str, float]) -> SeenImage:
+def refused_before(
+    job: RigJob, photo: Photo, mapped: Sequence[MapCamera], seconds: Mapping[str, float]
+) -> SeenImage:
     """Return a photo on its own that ``job.refused`` says enough about as it was sent."""
     assert job.refused is not None
     (image,), read_as = job.images, job.options.orientation
-    used, source = resolve_camera(photo, image.camera)
+    used, source = resolve_camera(photo, image.camera, mapped)
     evidence = Evidence(used, source, photo.exif_orientation, read_as, seconds=seconds)
     return SeenImage.alone(Look.nothing(evidence, job.refused))
 

@@ -149,7 +149,7 @@ class Vision:
         self._step()
         (image,) = job.images
         if job.refused is not None and isinstance(decoded.query, Photo):
-            return refused_before(job, decoded.query, seconds)
+            return refused_before(job, decoded.query, target.localizer.map_cameras, seconds)
         seen = target.look(image, decoded, job.options, job.priors, seconds)
         if seen.error is not None:
             raise seen.error

@@ -241,6 +241,7 @@ def test_focal_length_from_the_sensors_resolution() -> None:
     "details",
     [
         {},
+        {"FocalLengthIn35mmFilm": 26, "DigitalZoomRatio": 2.0},  # with it, or without?
         {"FocalLengthIn35mmFilm": 0},  # EXIF's word for unknown
         {"FocalLengthIn35mmFilm": 1},  # implausible
         {"FocalLength": 4.2},  # says nothing without the sensor's size

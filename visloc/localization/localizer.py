@@ -142,7 +142,7 @@ class Localizer:
                 self._descriptors[name] = descriptor
         self._named = NamedPhotos(opened)
         self.geometry = MapGeometry(opened)
-        self._map_cameras = map_cameras(opened)
+        self.map_cameras = map_cameras(opened)
         self._coarse = CoarsePoses(self.geometry)
         self.turns = (
             None if extractor is None else TurnFinder(self.geometry, extractor, self._descriptors)
@@ -262,13 +262,18 @@ class Localizer:
         priors: Priors = NO_PRIORS,
         cache: FeatureCache | None = None,
         turned: int = 0,
+        *,
+        alone: bool = True,
     ) -> Look:
-        """Match a photo with the map, as ``localize``; ``turned`` is what ``turns`` found, or 0."""
+        """Match a photo with the map, as ``localize``.
+
+        ``turned`` is what ``turns`` found, or 0; ``alone`` is false for a photo of a rig.
+        """
         fusion = self._fusion(options)
         if self._extractor is None or not self._takes_photos(fusion):
             raise self._features_required(fusion)
         constraints = Constraints(self.geometry, priors)
-        used, source = resolve_camera(photo, camera, self._map_cameras)
+        used, source = resolve_camera(photo, camera, self.map_cameras, alone=alone)
         seconds: dict[str, float] = {}
         evidence = Evidence(used, source, photo.exif_orientation, options.orientation)
         evidence = replace(evidence, turned=turned, seconds=seconds)

@@ -190,8 +190,8 @@ def solve_instant(
         )
         if refusal is None or refusal.reason is not Reason.CONTRADICTS_PRIOR:
             elsewhere = _views_of(images, [look.elsewhere for look in looks], options)
-            elsewhere = tuple(  # of a search that does not believe EXIF, with its camera
-                replace(view, focal_unknown=searched.focal_unknown)
+            elsewhere = tuple(  # with the camera of the search, which may not believe EXIF
+                replace(view, camera=searched.camera, focal_unknown=searched.focal_unknown)
                 for view, searched in zip(elsewhere, problem.views, strict=True)
             )
             refusal = not_better_elsewhere(problem.of(elsewhere), found) or refusal
@@ -385,8 +385,9 @@ def _find_pose(
     if as_guess is None:
         return problem, best, refusal
     again, still = _judged(as_guess)
-    is_hint = problem.sources == (CameraSource.MAP,)  # its refusal says less of the photo
-    return (problem, best, refusal) if is_hint and still is not None else (as_guess, again, still)
+    if still is not None and problem.sources == (CameraSource.MAP,):
+        return problem, best, refusal  # which a known camera makes the more telling one
+    return as_guess, again, still
 
 
 def _without_camera(

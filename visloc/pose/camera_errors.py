@@ -2,9 +2,8 @@
 
 Beside the pose, the matches of a photo tell by how much its camera is off:
 
-- the focal length, the principal point, and the radial distortion beyond that of its model:
-  ``u = c + L d + exp(a) (1 + k r^2) (u_given - c)`` with the principal point c, the longer side L
-  and the distance r of a ray from the optical axis at depth 1;
+- the focal length, the principal point, and the first radial coefficient, if its model may have
+  one;
 - the shutter: rows are read one after another, while the camera moves. The pose is that of the
   middle row.
 
@@ -28,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.geometry import CAMERA_MODELS, Camera, Pose, cross_matrix
+from visloc.pose.colmap import project
 from visloc.pose.motion import moved
 from visloc.pose.refinement import LOSS_SCALE_PX
 from visloc.pose.reprojection import has_derivative, linearized, reprojection_errors
@@ -40,13 +40,14 @@ _PARTS = 10
 # Each has a prior of its own, but both coordinates of the principal point share one.
 _FIRSTS = np.array([FOCAL, SHIFT_X, RADIAL, *range(4, 10)])
 _SIZES = np.array([1, 2, *[1] * 7])
-# Standard deviations with which a photo says that a part is off: from the second on it is
-# corrected, between both the pose only becomes as uncertain.
+# Standard deviations by which the photo must say that a part is off. From the second on the part is
+# corrected; between both, its change only adds to the uncertainty of the pose.
 _MAYBE, _SURE = 1.0, 2.5
-# Changes that are so many of the widest prior's deviations are no error of a camera.
+# A camera with a change of more than 2.5 standard deviations of the widest prior is another camera:
+# it is not corrected.
 _MOST = 2.5
-_LEAST_INLIERS = 30
-# The longer side is divided into so many cells; matches of one err alike.
+_LEAST_INLIERS = 12
+# Cells along the longer side. Matches of one cell err alike.
 _CELLS = 8
 # No photo tells of less.
 _RIGHT = 0.001
@@ -55,7 +56,8 @@ _RIGHT = 0.001
 _WIDTHS = (2.0, 1.0, 1.0, 1.0, 1.0)
 _MOST_UPDATES, _CONVERGED = 30, 0.02
 _MIN_VARIANCE_PX2, _LEAST_DEPTH = 1e-8, 1e-9
-# The models that have a first radial coefficient, and the name of that.
+_STEP = 1e-4  # of a numerical derivative by a radial coefficient
+# The name of the first radial coefficient in the models that have one, and the model that adds one.
 _RADIAL_OF = {"SIMPLE_RADIAL": "k", "RADIAL": "k1", "OPENCV": "k1", "FULL_OPENCV": "k1"}
 _WITH_RADIAL = {"SIMPLE_PINHOLE": "SIMPLE_RADIAL", "PINHOLE": "OPENCV"}
 
@@ -75,7 +77,7 @@ class CameraPrior:
     wrong: tuple[float, float, float, float]
 
 
-_GIVEN = CameraPrior((0.0003, 0.0003, 0.001, 0.0003), (0.05, 0.03, 0.1, 0.03))
+_GIVEN = CameraPrior((0.0003, 0.0003, 0.001, 0.0003), (0.05, 0.03, 0.2, 0.03))
 # EXIF rounds to whole millimetres, lenses breathe, and phones stabilize.
 _EXIF = CameraPrior((0.03, 0.01, 0.01, 0.0003), (0.05, 0.03, 0.2, 0.03))
 _ESTIMATED = CameraPrior((0.3, 0.01, 0.01, 0.0003), (0.5, 0.03, 0.2, 0.03))
@@ -127,12 +129,15 @@ def find_camera_errors(
     Returns:
         None when there are too few inliers to tell anything.
     """
-    used = [row for row, view in enumerate(views) if len(view)]
-    if not used:
+    near = [_near(view, rig_from_world, max_error_px) for view in views]
+    used = [row for row, seen in enumerate(near) if seen is not None]
+    seen = [each for each in near if each is not None]
+    if not seen:
         return None
-    seen = [_near(views[row], rig_from_world, max_error_px) for row in used]
-    both = [_deviations(views[row], priors[row]) for row in used]
-    right, wrong = map(np.concatenate, zip(*both, strict=True))
+    right, wrong = (
+        np.concatenate([_by_part(prior) for prior in each])
+        for each in zip(*((priors[row].right, priors[row].wrong) for row in used), strict=True)
+    )
     pose, change = rig_from_world, np.zeros(len(right))
     for width in _WIDTHS:
         normal = _normal_equations(seen, pose, change, wrong, width, max_error_px, factor)
@@ -151,35 +156,40 @@ def find_camera_errors(
     of_camera = by_camera @ found.covariance @ by_camera.T
     corrected = list(views)
     if change.any():
-        for row, parts in zip(used, change.reshape(-1, _PARTS), strict=True):
-            corrected[row] = _corrected(views[row], pose, parts)
+        for row, each, parts in zip(used, seen, change.reshape(-1, _PARTS), strict=True):
+            corrected[row] = _corrected(views[row], each.depth, pose, parts)
     of_camera = (of_camera + of_camera.T) / 2
     return CameraErrors(pose, tuple(corrected), bool(change.any()), of_camera)
 
 
-def _deviations(
-    view: MatchedView, prior: CameraPrior
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the standard deviations (10,) of a right camera, and of a wrong one."""
-    both = []
-    for focal, centre, radial, shutter in (prior.right, prior.wrong):
-        if view.camera.model not in {*_RADIAL_OF, *_WITH_RADIAL}:
-            radial = prior.right[RADIAL - 1] * 1e-3
-        both.append(np.array([focal, centre, centre, radial, *[shutter] * 6]))
-    return both[0], both[1]
+def _by_part(stds: tuple[float, float, float, float]) -> NDArray[np.float64]:
+    """Return the standard deviations (10,) of a prior."""
+    focal, centre, radial, shutter = stds
+    return np.array([focal, centre, centre, radial, *[shutter] * 6])
 
 
-def _near(view: MatchedView, rig_from_world: Pose, max_error_px: float) -> MatchedView:
-    """The matches that a corrected camera may explain."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Near:
+    """The matches of a view that a corrected camera may explain, and their median depth."""
+
+    view: MatchedView
+    depth: float
+
+
+def _near(view: MatchedView, rig_from_world: Pose, max_error_px: float) -> _Near | None:
     view = replace(view, focal_unknown=False)
     with np.errstate(invalid="ignore"):  # landmarks that are no numbers
-        near = reprojection_errors(view, rig_from_world) <= 4.0 * max_error_px
-    return view.selected(near)
+        errors = reprojection_errors(view, rig_from_world)
+    if not (errors <= max_error_px).any():
+        return None
+    view = view.selected(errors <= 4.0 * max_error_px)
+    depths = (view.cam_from_rig @ rig_from_world).apply(view.points)[:, 2]
+    return _Near(view, max(float(np.median(depths)), _LEAST_DEPTH))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Normal:
-    """Normal equations of inliers, by the pose and the change of the cameras, in (n) errors.
+    """Normal equations of the inliers, by the pose and the change of the cameras.
 
     Attributes:
         information: (k, k), with the errors that landmarks share.
@@ -191,7 +201,7 @@ class _Normal:
 
 
 def _normal_equations(
-    views: Sequence[MatchedView],
+    seen: Sequence[_Near],
     pose: Pose,
     change: NDArray[np.float64],
     wrong: NDArray[np.float64],
@@ -205,8 +215,9 @@ def _normal_equations(
     """
     size = 6 + len(change)
     errors, rows, cells = [np.empty((0, 2))], [np.empty((size, 2, 0))], [np.empty(0, np.int64)]
-    for number, (view, parts) in enumerate(zip(views, change.reshape(-1, _PARTS), strict=True)):
-        of_view, by_pose, by_part = _linearized(view, pose, parts)
+    for number, (near, parts) in enumerate(zip(seen, change.reshape(-1, _PARTS), strict=True)):
+        view = near.view
+        of_view, by_pose, by_part = _linearized(view, near.depth, pose, parts)
         inliers = np.hypot(*of_view.T) <= width * max_error_px
         of_all = np.zeros((size, 2, int(inliers.sum())))
         of_all[:6] = by_pose[:, :, inliers]
@@ -217,7 +228,7 @@ def _normal_equations(
         column, row = np.clip(view.pixels[inliers] // side, 0, _CELLS).astype(np.int64).T
         cells.append((number * (_CELLS + 1) + row) * (_CELLS + 1) + column)
     error, by_all = np.concatenate(errors), np.concatenate(rows, axis=2)
-    if len(error) < max(_LEAST_INLIERS, size):
+    if len(error) < _LEAST_INLIERS:
         return None
     squared = np.sum(error**2, axis=1)
     weight = 1.0 / (1.0 + squared / (width * LOSS_SCALE_PX) ** 2)
@@ -228,7 +239,7 @@ def _normal_equations(
     variance = max(float(weight @ squared) / (2.0 * float(weight.sum())), _MIN_VARIANCE_PX2)
     weighted = weight * by_all
     gradient = np.einsum("ian,na->i", weighted, error)
-    # As they are where the cameras are free.
+    # What is left of the errors after a step with free cameras.
     free = np.linalg.inv(information + _inverse_variances(wrong, variance))
     error = error - np.einsum("ian,i->na", by_all, free @ gradient)
     each = np.einsum("ian,na->ni", weighted, error)
@@ -249,11 +260,11 @@ def _shared(
     cells: NDArray[np.int64],
     variance: float,
 ) -> float:
-    """Return how many times as uncertain as independent errors those of neighbours leave cameras.
+    """Return the factor by which errors that neighbours share widen the variance of the parts.
 
-    The variance of the parts with errors that are independent between cells only (Liang and Zeger,
-    "Longitudinal data analysis using generalized linear models", 1986) over that with errors that
-    are all independent; at least 1.
+    The variance with errors that are independent between cells only (Liang and Zeger, "Longitudinal
+    data analysis using generalized linear models", 1986) over the one with independent errors; at
+    least 1.
 
     Args:
         information: (k, k) for errors of one pixel.
@@ -267,8 +278,9 @@ def _shared(
     np.add.at(sums, number, gradients)
     spare = max(len(sums) - len(free), 1) / len(sums)
     clustered = np.einsum("ci,cj->ij", sums, sums) / spare
-    ratio = np.diag(free @ clustered @ free) / np.diag(free @ information @ free)
-    return max(1.0, float(ratio[6:].mean()) / variance)
+    shared, independent = (np.diag(free @ m @ free)[6:] for m in (clustered, information))
+    told = independent > 0
+    return max(1.0, float(np.mean(shared[told] / independent[told])) / variance)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -312,10 +324,11 @@ def _relevant(
         if np.abs(np.log(stds / before)).max() < _CONVERGED:
             break
     sure = _grouped(np.maximum, np.abs(found[6:]) / np.sqrt(variances))
-    sure[(stds <= 1.05 * right) | (np.abs(found[6:]) > _MOST * wrong).any()] = 0.0
-    off = sure > _SURE
-    best, covariance = solved(np.where(off, stds, right))
+    sure[stds <= 1.05 * right] = 0.0
+    beyond = (np.abs(found[6:]) > _MOST * wrong).reshape(-1, _PARTS).any(axis=1)
+    off = (sure > _SURE) & ~np.repeat(beyond, _PARTS)
     doubtful = (sure > _MAYBE) & ~off
+    best, covariance = solved(np.where(off, stds, right))
     if doubtful.any():
         _, covariance = solved(np.where(off | doubtful, stds, right))
     by_parts = covariance[6:, 6:] + np.outer(*[np.where(doubtful, found[6:], 0.0)] * 2)
@@ -330,57 +343,67 @@ def _grouped(combine: np.ufunc, values: NDArray[np.float64]) -> NDArray[np.float
 
 
 def _linearized(
-    view: MatchedView, pose: Pose, change: NDArray[np.float64]
+    view: MatchedView, depth: float, pose: Pose, change: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return errors (n, 2) of a changed camera, NaN where they have no derivative.
 
     And their derivatives by the pose (6, 2, n) and by the change (10, 2, n).
     """
+    view = replace(view, camera=_changed(view.camera, change))
     errors, jacobian = linearized([view], pose, about=np.zeros(3))
     errors = np.where(has_derivative(errors, jacobian)[:, None], errors, np.nan)
-    seen = (view.cam_from_rig @ pose).apply(view.points)
-    beside = np.sum(seen[:, :2] ** 2, axis=1) / seen[:, 2] ** 2
-    zoom = math.exp(change[FOCAL])
-    radial = 1.0 + change[RADIAL] * beside
-    from_centre = np.asarray((errors + view.pixels - view.principal_point) * zoom)
-    by_pose = jacobian.T[:6] * (zoom * radial)
+    by_pose = jacobian.T[:6]
     by_part = np.zeros((_PARTS, 2, len(view)))
-    by_part[FOCAL] = (from_centre * radial[:, None]).T
+    # Every model multiplies by the focal length at last, then adds the principal point.
+    by_part[FOCAL] = (errors + view.pixels - view.principal_point).T
     longer_side = max(view.camera.width, view.camera.height)
     by_part[SHIFT_X, 0] = by_part[SHIFT_Y, 1] = longer_side
-    by_part[RADIAL] = from_centre.T * beside
-    by_part[_SHUTTER] = by_pose * _row(view)
-    by_part[_SHUTTER][3:] *= max(float(np.median(seen[:, 2])), _LEAST_DEPTH)
-    shifted = by_part[FOCAL].T + view.principal_point + longer_side * change[[SHIFT_X, SHIFT_Y]]
+    by_part[RADIAL] = _by_radial(view, pose)
+    by_part[_SHUTTER] = by_pose * (view.pixels[:, 1] / view.camera.height - 0.5)
+    by_part[_SHUTTER][3:] *= depth
     moving = np.einsum("ian,i->na", by_part[_SHUTTER], change[_SHUTTER])
-    return shifted + moving - view.pixels, by_pose, by_part
+    return errors + moving, by_pose, by_part
 
 
-def _row(view: MatchedView) -> NDArray[np.float64]:
-    """Return how far (n,) pixels lie below the middle row, in heights of the photo."""
-    return np.asarray(view.pixels[:, 1] / view.camera.height - 0.5)
+def _by_radial(view: MatchedView, pose: Pose) -> NDArray[np.float64]:
+    """Return the derivatives (2, n) by the first radial coefficient; 0 if the model has none."""
+    in_cam = (view.cam_from_rig @ pose).apply(view.points)
+    if view.camera.model in _WITH_RADIAL:  # pinholes
+        rays = in_cam[:, :2] / in_cam[:, 2:]
+        params = dict(zip(CAMERA_MODELS[view.camera.model], view.camera.params, strict=True))
+        focal = np.array([params.get("fx", params.get("f")), params.get("fy", params.get("f"))])
+        return np.asarray((focal * rays * np.sum(rays**2, axis=1, keepdims=True)).T)
+    if view.camera.model not in _RADIAL_OF:
+        return np.zeros((2, len(view)))
+    change = np.zeros(_PARTS)
+    change[RADIAL] = _STEP
+    more, less = (project(_changed(view.camera, by), in_cam) for by in (change, -change))
+    return np.asarray((more - less).T / (2 * _STEP))
 
 
-def _corrected(view: MatchedView, pose: Pose, change: NDArray[np.float64]) -> MatchedView:
-    """Return a view with its camera changed, and its pixels as without the shutter's motion."""
-    camera, pixels = view.camera, view.pixels
-    if change[_SHUTTER].any():
-        _, _, by_part = _linearized(replace(view, focal_unknown=False), pose, change)
-        moving = np.einsum("ian,i->na", by_part[_SHUTTER], change[_SHUTTER])
-        pixels = pixels - np.where(np.isfinite(moving), moving, 0.0)
+def _changed(camera: Camera, change: NDArray[np.float64]) -> Camera:
+    """Return a camera with another focal length, principal point and first radial coefficient."""
     longer_side, zoom = max(camera.width, camera.height), math.exp(change[FOCAL])
     params = dict(zip(CAMERA_MODELS[camera.model], camera.params, strict=True))
-    for name in ("f", "fx", "fy"):
-        if name in params:
-            params[name] *= zoom
+    params |= {name: zoom * params[name] for name in ("f", "fx", "fy") if name in params}
     params["cx"] += longer_side * float(change[SHIFT_X])
     params["cy"] += longer_side * float(change[SHIFT_Y])
     model = camera.model
-    if change[RADIAL] and (model in _WITH_RADIAL or model in _RADIAL_OF):
+    if change[RADIAL]:
         model = _WITH_RADIAL.get(model, model)
-        params[_RADIAL_OF[model]] = params.get(_RADIAL_OF[model], 0.0) + float(change[RADIAL])
-    names = CAMERA_MODELS[model]
-    corrected = Camera(
-        model, camera.width, camera.height, tuple(params.get(name, 0.0) for name in names)
-    )
-    return replace(view, camera=corrected, pixels=pixels)
+        name = _RADIAL_OF[model]
+        params[name] = params.get(name, 0.0) + float(change[RADIAL])
+    values = tuple(params.get(name, 0.0) for name in CAMERA_MODELS[model])
+    return Camera(model, camera.width, camera.height, values)
+
+
+def _corrected(
+    view: MatchedView, depth: float, pose: Pose, change: NDArray[np.float64]
+) -> MatchedView:
+    """Return a view with its camera changed, and its pixels as without the shutter's motion."""
+    changed = replace(view, camera=_changed(view.camera, change))
+    if not change[_SHUTTER].any():
+        return changed
+    _, _, by_part = _linearized(replace(view, focal_unknown=False), depth, pose, change)
+    moving = np.einsum("ian,i->na", by_part[_SHUTTER], change[_SHUTTER])
+    return replace(changed, pixels=view.pixels - np.where(np.isfinite(moving), moving, 0.0))

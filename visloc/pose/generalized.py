@@ -49,8 +49,8 @@ class GeneralizedPose:
         camera: with the focal length that was found together with the pose; None where it was
             known.
         probability: that it is right, 0 to 1; None when it was not judged.
-        of_camera: (6, 6), the part of ``covariance`` that an unknown principal point adds; None
-            for a known camera.
+        of_camera: (6, 6), the part of ``covariance`` that errors of the cameras add, or at first
+            that of an unknown principal point; None where there is none.
     """
 
     rig_from_world: Pose

@@ -71,7 +71,7 @@ class CameraOrigin(BaseModel):
 
     Attributes:
         source: ``exif``, ``given`` (by the dataset), or ``estimated`` from the photos alone.
-        name: make and model by EXIF; "" if the dataset gave the camera.
+        name: of the sensor, for imported photos make and model; "" if the dataset gave the camera.
         prior_px: the focal length of EXIF or the dataset; None if estimated.
         doubt: why the prior was kept; if estimated, why it may be far off.
         refined_px: the refined value of a camera in doubt; None if it is not finite.

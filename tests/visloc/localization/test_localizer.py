@@ -385,6 +385,40 @@ def test_without_a_camera_exif_is_used_and_else_a_stated_guess() -> None:
     assert resolve_camera(Photo(rgb, 1, 300.0), given) == (given, CameraSource.GIVEN)
 
 
+def test_photo_without_a_camera_is_answered_with_that_of_the_map(
+    localizer: Localizer, query: Query
+) -> None:
+    answer = localized(localizer.localize(read_photo(query.image), None, OPTIONS))
+    assert answer.evidence.camera_source is CameraSource.MAP
+    assert pose_error(answer.cam_from_world, query.cam_from_world)[0] < 0.02
+
+
+def test_photo_that_the_cameras_of_the_map_did_not_take_is_answered_without_them(
+    localizer: Localizer, query: Query
+) -> None:
+    rgb = read_photo(query.image).rgb
+    height, width = rgb.shape[:2]
+    middle = rgb[height // 5 : -height // 5, width // 5 : -width // 5]
+    zoomed = Photo(cv2.resize(middle, (width, height), interpolation=cv2.INTER_CUBIC))
+    answer = localized(localizer.localize(zoomed, None, OPTIONS))
+    assert answer.evidence.camera_source is CameraSource.ESTIMATED
+    assert answer.evidence.camera.focal_length == pytest.approx(
+        query.camera.focal_length / 0.6, rel=0.02
+    )
+
+
+@pytest.mark.parametrize("zoom", [0.98, 1.02])
+def test_given_focal_length_that_is_off_is_corrected(
+    localizer: Localizer, query: Query, zoom: float
+) -> None:
+    fx, fy, cx, cy = query.camera.params
+    sent = replace(query.camera, params=(zoom * fx, zoom * fy, cx, cy))
+    answer = localized(localizer.localize(read_photo(query.image), sent, OPTIONS))
+    assert answer.evidence.camera_source is CameraSource.GIVEN
+    assert answer.evidence.camera.focal_length == pytest.approx(fx, rel=0.005)
+    assert pose_error(answer.cam_from_world, query.cam_from_world)[0] < 0.02
+
+
 # Features instead of a photo
 
 

@@ -115,10 +115,61 @@ def test_errors_that_the_landmarks_share_take_the_say_from_the_photo() -> None:
 
 def test_wall_parallel_to_the_picture_does_not_tell_the_focal_length() -> None:
     view = seen(0, told=WRONG["focal length 2 % too long"], depth=(4.0, 4.02))
-    found = found_in(view)
-    stated = position_covariance(found.rig_from_world, found.of_camera)
-    off = np.linalg.norm(found.rig_from_world.center - POSE.center)
-    assert not found.corrected or off <= 3 * np.sqrt(np.trace(stated))
+    assert not found_in(view).corrected
+
+
+def test_distortion_of_another_lens_is_carried_and_not_corrected() -> None:
+    found = found_in(seen(0, taken=changed(k1=-0.9)))
+    right = found_in(seen(0))
+    assert not found.corrected
+    std, std_of_right = (
+        np.sqrt(np.trace(position_covariance(each.rig_from_world, each.of_camera)))
+        for each in (found, right)
+    )
+    assert std > 20 * std_of_right
+
+
+def test_wrong_coefficient_of_a_distorted_camera_is_corrected() -> None:
+    found = found_in(seen(0, taken=changed(k1=-0.25), told=changed(k1=-0.30)))
+    assert found.corrected
+    assert found.views[0].camera.params[4] == pytest.approx(-0.25, abs=0.005)
+    assert np.linalg.norm(found.rig_from_world.center - POSE.center) < 0.004
+
+
+def test_matches_that_are_no_numbers_or_wrong_change_nothing() -> None:
+    view, random = seen(0, motion=2 * MOTION), np.random.default_rng(1)
+    wrong = view.points[:300] * random.uniform(10, 20, (300, 1))
+    more = replace(
+        view,
+        pixels=np.concatenate([view.pixels, view.pixels[:301]]),
+        points=np.concatenate([view.points, wrong, np.full((1, 3), np.nan)]),
+    )
+    found, beside = found_in(view), found_in(more)
+    np.testing.assert_allclose(beside.views[0].pixels[:900], found.views[0].pixels, atol=0.05)
+
+
+def test_known_error_of_exif_is_carried_where_few_matches_tell() -> None:
+    few = seen(0).selected(np.arange(14))
+    stated = {}
+    for source in (CameraSource.GIVEN, CameraSource.EXIF):
+        found = find_camera_errors(
+            [few], [PRIORS[source]], POSE, max_error_px=MAX_ERROR_PX, factor=1.0
+        )
+        assert found is not None
+        stated[source] = np.trace(position_covariance(found.rig_from_world, found.of_camera))
+    assert stated[CameraSource.EXIF] > 10 * stated[CameraSource.GIVEN]
+
+
+def test_rig_view_that_shows_nothing_weighs_nothing() -> None:
+    behind = seen(1)
+    behind = replace(behind, points=2 * POSE.center - behind.points)
+    alone, beside = (
+        find_camera_errors(views, [GIVEN] * len(views), POSE, max_error_px=MAX_ERROR_PX, factor=1.0)
+        for views in ([seen(0)], [seen(0), behind])
+    )
+    assert alone is not None
+    assert beside is not None
+    np.testing.assert_array_equal(alone.of_camera, beside.of_camera)
 
 
 def test_stated_part_of_the_camera_covers_what_is_left() -> None:

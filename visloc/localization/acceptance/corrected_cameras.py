@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
 from visloc.localization.acceptance.gates import Problem
 from visloc.options import Solver
 from visloc.pose.camera_errors import PRIORS, find_camera_errors
@@ -48,11 +52,19 @@ def with_corrected_cameras(
             or refined.covariance is None
             or refined.num_inliers < _LEAST_KEPT * pose.num_inliers
         ):
-            return problem, pose
+            # It is off all the same.
+            a, b = found.rig_from_world, pose.rig_from_world
+            turned = Rotation.from_matrix(a.rotation @ b.rotation.T).as_rotvec()
+            apart = np.concatenate([turned, a.translation - b.translation])
+            return problem, _widened(pose, found.of_camera + np.outer(apart, apart))
         best, views = replace(refined, probability=pose.probability), found.views
         if pose.camera is not None:  # found with the pose, also when matches are drawn again
             best = replace(best, camera=views[0].camera)
             views = (replace(views[0], focal_unknown=True),)
-    assert best.covariance is not None
-    covariance = best.covariance + found.of_camera
-    return problem.of(views), replace(best, covariance=covariance, of_camera=found.of_camera)
+    return problem.of(views), _widened(best, found.of_camera)
+
+
+def _widened(pose: GeneralizedPose, of_camera: NDArray[np.float64]) -> GeneralizedPose:
+    assert pose.covariance is not None
+    before = 0.0 if pose.of_camera is None else pose.of_camera
+    return replace(pose, covariance=pose.covariance - before + of_camera, of_camera=of_camera)

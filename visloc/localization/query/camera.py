@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -36,11 +37,14 @@ class MapCamera:
     name: str
     exif_px: float | None
 
-    def took(self, photo: Photo) -> bool:
+    def took(self, photo: Photo, *, alone: bool = True) -> bool:
         """Tell whether the camera seems to have taken a photo: by its size, make, model and lens.
 
-        A photo without any of these may be of any camera of its size.
+        A photo that tells none of these, of a camera that is not known by any, may be of any camera
+        of its size. Only of a photo on its own is it tried: there, a wrong camera does no harm.
         """
+        if not alone and not self.name:
+            return False
         size = photo.file_size or (photo.width, photo.height)
         if (self.camera.width, self.camera.height) != size or self.name != photo.camera_name:
             return False
@@ -51,17 +55,22 @@ class MapCamera:
 
 def map_cameras(opened: Map) -> tuple[MapCamera, ...]:
     """Return the cameras of a map's photos, those of most photos first."""
-    origins = opened.manifest.method.settings.get("cameras")
+    told = opened.manifest.method.settings.get("cameras")
+    origins = told if isinstance(told, dict) else {}
     found = []
     for sensor, _ in Counter(image.camera for image in opened.images).most_common():
-        origin = origins.get(sensor) if isinstance(origins, dict) else None
+        origin = origins.get(sensor)
         told = origin if isinstance(origin, dict) else {}
+        if told.get("doubt") is not None:
+            continue  # the photos of the map did not determine it
         name, prior = told.get("name"), told.get("prior_px")
-        exif_px = (
-            float(prior) if told.get("source") == "exif" and isinstance(prior, float) else None
-        )
-        camera = opened.cameras[sensor]
-        found.append(MapCamera(camera, name if isinstance(name, str) else "", exif_px))
+        exif_px = None
+        if told.get("source") == "exif":
+            if not isinstance(prior, int | float) or not 0 < prior < math.inf:
+                continue  # no number that a build writes
+            exif_px = float(prior)
+        known = name if isinstance(name, str) else ""
+        found.append(MapCamera(opened.cameras[sensor], known, exif_px))
     return tuple(found)
 
 
@@ -77,7 +86,11 @@ def query_resolution(camera: Camera, source: CameraSource) -> Resolution:
 
 
 def resolve_camera(
-    photo: Photo, given: Camera | None, mapped: Sequence[MapCamera] = ()
+    photo: Photo,
+    given: Camera | None,
+    mapped: Sequence[MapCamera] = (),
+    *,
+    alone: bool = True,
 ) -> tuple[Camera, CameraSource]:
     """Choose the intrinsics of a photo.
 
@@ -93,7 +106,7 @@ def resolve_camera(
     """
     width, height = photo.width, photo.height
     if given is None:
-        of_map = next((one.camera for one in mapped if one.took(photo)), None)
+        of_map = next((one.camera for one in mapped if one.took(photo, alone=alone)), None)
         if of_map is not None:
             return of_map.reduced(photo.reduced), CameraSource.MAP
         if photo.focal_length_px is None:
