@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -197,7 +198,7 @@ class _Job:
             placed,
             settings.poses,
             self._lifted if by_depth else None,
-            readings_of(self.dataset, tried.photos),
+            partial(readings_of, self.dataset, tried.photos),
             metric=settings.metric,
         )
         if settings.poses == "localize":

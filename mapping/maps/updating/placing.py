@@ -101,7 +101,7 @@ def place_capture(
     placed: Sequence[Placed],
     poses: str,
     lift: Lift | None,
-    readings: Mapping[str, Callable[[], list[Pose]]],
+    readings: Callable[[], Mapping[str, Callable[[], list[Pose]]]],
     *,
     metric: bool,
 ) -> Placement:
@@ -114,7 +114,7 @@ def place_capture(
         poses: a name of ``mapping.maps.updating.settings.POSES``.
         lift: lifts pixels by the depth of their photo. Depth is compared with the map, and refines
             a tie. None without depth.
-        readings: the photos' own poses as other conventions have them, to name a mistake.
+        readings: returns the photos' own poses as other conventions have them, to name a mistake.
         metric: whether a unit of the photos' own poses is a metre.
 
     Raises:
@@ -137,7 +137,7 @@ def place_capture(
     else:
         agrees = [_fits(photo, one) for photo, one in both]
         if sum(agrees) <= len(both) / 2:  # a tie needs more than half, too
-            named = _named(photos, placed, readings)
+            named = _named(photos, placed, readings())
             raise _elsewhere(
                 f"{localized}, but only {sum(agrees)} where --poses given has them{named}",
                 "poses in the map's frame, or --poses tie",

@@ -111,7 +111,7 @@ def test_a_request_without_a_camera_is_answered_with_where_the_intrinsics_come_f
 ) -> None:
     answer = doors.stub.Localize(pb2.LocalizeRequest(map="room", image=query.image))
 
-    assert answer.camera.source == "estimated"
+    assert answer.camera.source == "map"
 
 
 def test_a_request_id_comes_back_and_one_is_made_when_it_is_missing(doors: Any, query: Any) -> None:
