@@ -56,6 +56,7 @@ _RIGHT = 0.001
 _WIDTHS = (2.0, 1.0, 1.0, 1.0, 1.0)
 _MOST_UPDATES, _CONVERGED = 30, 0.02
 _MIN_VARIANCE_PX2, _LEAST_DEPTH = 1e-8, 1e-9
+_MIN_INFORMATION = 1e-12  # least eigenvalue, with a diagonal of 1
 _STEP = 1e-4  # of a numerical derivative by a radial coefficient
 # The name of the first radial coefficient in the models that have one, and the model that adds one.
 _RADIAL_OF = {"SIMPLE_RADIAL": "k", "RADIAL": "k1", "OPENCV": "k1", "FULL_OPENCV": "k1"}
@@ -127,7 +128,7 @@ def find_camera_errors(
         factor: by how much poses in the map are further off than the scatter of matches tells.
 
     Returns:
-        None when there are too few inliers to tell anything.
+        None when the inliers are too few to tell anything, or leave the pose undetermined.
     """
     near = [_near(view, rig_from_world, max_error_px) for view in views]
     used = [row for row, seen in enumerate(near) if seen is not None]
@@ -147,7 +148,8 @@ def find_camera_errors(
         if width == 1.0 and not found.off.any() and (right <= _RIGHT).all():
             pose, change = rig_from_world, np.zeros(len(right))
             break  # as most given cameras are
-        pose, change = moved(pose, found.step), found.change
+        most = _MOST * wrong
+        pose, change = moved(pose, found.step), np.clip(found.change, -most, most)
     assert normal is not None
     by_camera = -np.linalg.solve(normal.information[:6, :6], normal.information[:6, 6:])
     additive = np.eye(6)
@@ -211,7 +213,7 @@ def _normal_equations(
 ) -> _Normal | None:
     """Return the equations of all views at a pose and a change of their cameras.
 
-    None when there are few inliers.
+    None when there are few inliers, or they leave the pose undetermined.
     """
     size = 6 + len(change)
     errors, rows, cells = [np.empty((0, 2))], [np.empty((size, 2, 0))], [np.empty(0, np.int64)]
@@ -236,6 +238,10 @@ def _normal_equations(
     # number of threads.
     columns = (np.sqrt(weight) * by_all).reshape(size, -1)
     information = np.einsum("in,jn->ij", columns, columns)
+    units = np.sqrt(np.diag(information)[:6])
+    of_pose = information[:6, :6] / np.outer(units, units) if units.all() else np.zeros((6, 6))
+    if not np.isfinite(information).all() or np.linalg.eigvalsh(of_pose)[0] < _MIN_INFORMATION:
+        return None
     variance = max(float(weight @ squared) / (2.0 * float(weight.sum())), _MIN_VARIANCE_PX2)
     weighted = weight * by_all
     gradient = np.einsum("ian,na->i", weighted, error)

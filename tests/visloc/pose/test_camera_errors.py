@@ -182,7 +182,7 @@ def test_stated_part_of_the_camera_covers_what_is_left() -> None:
         assert best.covariance is not None
         whole = position_covariance(best.rig_from_world, best.covariance + found.of_camera)
         error = best.rig_from_world.center - POSE.center
-        inside += error @ np.linalg.solve(whole, error) <= 7.81  # 95 % of chi-square with three
+        inside += bool(error @ np.linalg.solve(whole, error) <= 7.81)  # 95 % of chi-square with three
     assert inside >= 17
 
 
@@ -209,6 +209,21 @@ def test_views_without_matches_stay_as_they_are() -> None:
 def test_few_matches_tell_nothing(rows: int) -> None:
     few = seen(0).selected(np.arange(rows))
     assert find_camera_errors([few], [GIVEN], POSE, max_error_px=12.0, factor=1.0) is None
+
+
+@pytest.mark.parametrize("source", [CameraSource.GIVEN, CameraSource.EXIF, CameraSource.ESTIMATED])
+@pytest.mark.parametrize("spread", [0.0, 1e-9])
+def test_points_on_a_line_or_in_a_spot_tell_nothing(source: CameraSource, spread: float) -> None:
+    view, random = seen(0), np.random.default_rng(0)
+    for ends in (np.zeros(3), np.array([1.0, 0.0, 0.0])):
+        in_cam = np.array([0.1, 0.1, 4.0]) + random.uniform(0, 1, (900, 1)) * ends
+        in_cam += random.normal(0, spread, (900, 3)) if spread else 0.0
+        points = POSE.inverse().apply(in_cam)
+        line = replace(view, points=points, pixels=project(TRUE, in_cam))
+        found = find_camera_errors(
+            [line], [PRIORS[source]], POSE, max_error_px=MAX_ERROR_PX, factor=1.0
+        )
+        assert found is None or np.isfinite(found.of_camera).all()
 
 
 def test_fisheye_keeps_its_distortion() -> None:
