@@ -182,7 +182,7 @@ def test_stated_part_of_the_camera_covers_what_is_left() -> None:
         assert best.covariance is not None
         whole = position_covariance(best.rig_from_world, best.covariance + found.of_camera)
         error = best.rig_from_world.center - POSE.center
-        inside += bool(error @ np.linalg.solve(whole, error) <= 7.81)  # 95 % of chi-square with three
+        inside += bool(error @ np.linalg.solve(whole, error) <= 7.81)  # 95 % of chi-square
     assert inside >= 17
 
 
