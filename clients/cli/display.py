@@ -23,7 +23,7 @@ _NUM_FAILED_SHOWN = 5
 _CAMERA_SOURCES: Mapping[str, str] = {
     "given": "as given",
     "given_scaled": "as given, scaled to the size of the photo",
-    "map": "of the map's photos by the same camera",
+    "map": "that of the map's own photos",
     "exif": "from the focal length in EXIF",
     "estimated": "estimated with the pose: give --camera for a better one",
     "guess": "a guess: give --camera for a better pose",

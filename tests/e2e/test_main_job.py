@@ -270,7 +270,7 @@ def test_a_photo_of_another_place_exits_with_3_and_has_no_pose(
     assert shown.returncode == 3
     assert shown.stdout.startswith("not localized")
     assert "gate (too_few_inliers)" in shown.stdout
-    assert "a guess" in shown.stdout
+    assert "that of the map's own photos" in shown.stdout
     answer = json.loads(localize(*command, "--json").stdout)
     assert (answer["status"], answer["pose"]) == ("not_localized", None)
     assert (answer["refusal"]["stage"], answer["refusal"]["reason"]) == ("gate", "too_few_inliers")

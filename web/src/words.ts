@@ -49,7 +49,7 @@ export function positionStd(std: number, metric: boolean): string {
 export const CAMERA_SOURCES: Readonly<Record<LocalizeResponse["camera"]["source"], string>> = {
   given: "as given",
   given_scaled: "as given for another size, scaled to this photo",
-  map: "of the map’s photos by the same camera",
+  map: "that of the map’s own photos",
   exif: "focal length from the photo’s EXIF",
   estimated: "focal length found together with the pose",
   guess: "guessed: the photo does not tell its focal length",
