@@ -5,7 +5,7 @@ import random
 from collections.abc import AsyncGenerator
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from starlette.datastructures import Headers, UploadFile
 from starlette.formparsers import MultiPartException, MultiPartParser
@@ -110,6 +110,7 @@ def reference(body: bytes) -> list[tuple[str, str | bytes]] | None:
         return None
 
 
+@settings(deadline=None)
 @given(st.randoms(use_true_random=False))
 def test_damaged_forms_are_read_as_starlette_reads_them(source: random.Random) -> None:
     contents = [
