@@ -1,4 +1,4 @@
-"""What each repair of sparse models is worth: poses of photos alone, with each left out in turn.
+"""Measures what each repair of sparse models is worth, by leaving out one after the other.
 
     python -m benchmarks.ablation DATA --work FOLDER [--only castle]
 

@@ -26,9 +26,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.geometry import CAMERA_MODELS, Camera, Pose, cross_matrix
+from visloc.geometry import CAMERA_MODELS, Camera, Pose
 from visloc.pose.colmap import project
-from visloc.pose.motion import moved
+from visloc.pose.motion import UncertainPose, moved
 from visloc.pose.refinement import LOSS_SCALE_PX
 from visloc.pose.reprojection import has_derivative, linearized, reprojection_errors
 from visloc.pose.views import MatchedView
@@ -152,10 +152,7 @@ def find_camera_errors(
         pose, change = moved(pose, found.step), np.clip(found.change, -most, most)
     assert normal is not None
     by_camera = -np.linalg.solve(normal.information[:6, :6], normal.information[:6, 6:])
-    additive = np.eye(6)
-    additive[3:, :3] = -cross_matrix(pose.translation)
-    by_camera = additive @ by_camera
-    of_camera = by_camera @ found.covariance @ by_camera.T
+    of_camera = UncertainPose(pose, by_camera @ found.covariance @ by_camera.T).additive()
     corrected = list(views)
     if change.any():
         for row, each, parts in zip(used, seen, change.reshape(-1, _PARTS), strict=True):

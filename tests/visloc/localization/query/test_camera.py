@@ -78,7 +78,7 @@ def test_cameras_of_a_map_come_by_their_photos() -> None:
 
 
 def opened(told: object, **others: Camera) -> Map:
-    """What ``map_cameras`` reads of a map with two photos of ``lens`` and one of each other."""
+    """Return a map, as far as ``map_cameras`` reads it; two of its photos are of ``lens``."""
     cameras = {"lens": LENS, **others}
     images = [SimpleNamespace(camera=name) for name in ("lens", *cameras)]
     settings = {} if told is None else {"cameras": told}
