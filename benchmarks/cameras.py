@@ -1,14 +1,15 @@
 """Queries whose camera is not quite right: error, and error over stated deviation.
 
-    python -m benchmarks.cameras exif given shutter zoom exact
-    python -m benchmarks.cameras held-out --data ../shared/data
+    python -m benchmarks.cameras exif given shutter zoom sequence exact
+    python -m benchmarks.cameras held-out zoomed-maps --data ../shared/data
 
 ``exif``: queries of the sample with EXIF's focal length in whole millimetres (24.75 is true);
 ``given``: with the sample's camera changed; ``shutter``: taken while the camera moves, rows read
 within 20 ms; ``zoom``: the middle quarter, with EXIF that tells the zoom beside the focal length
-without it; ``exact``: right cameras of several sets. ``held-out``: maps of photos alone without
-every fifth photo, which is asked without intrinsics, and with the map's camera. Maps are those of
-``make trust``; missing ones are built.
+without it; ``sequence``: a camera that is a little off, photos alone and in a sequence; ``exact``:
+right cameras of several sets. ``held-out``: maps of photos alone without every fifth photo, which
+is asked without intrinsics, and with the map's camera. ``zoomed-maps``: maps of photos alone, every
+tenth with digital zoom. Maps are those of ``make trust``; missing ones are built.
 """
 
 from __future__ import annotations
@@ -44,13 +45,21 @@ from visloc.geometry import Camera, PixelOrigin, Pose, Similarity, rotation_angl
 from visloc.images import read_photo_file
 from visloc.kapture import Dataset, FileRecord, read_dataset
 from visloc.localization.localizer import Localizer
+from visloc.localization.solving import SeenImage
 from visloc.options import LocalizeOptions
 from visloc.pose.centre import position_covariance
+from visloc.priors import NO_PRIORS
+from visloc.sequences.filling import TimeUnit
+from visloc.sequences.solver import SeenInstant, SequenceSolver
 from visloc.types import Localized
 
 QUERIES, ROWS_MS, BANDS = 10, 20.0, 24
 EXACT = (SAMPLE, "castle", "kitti_curve", "virtual_gallery", "redkitchen")
-HELD_OUT = ("castle", "lund_door", SAMPLE)
+HELD_OUT = (
+    *("castle", "lund_door", SAMPLE, "redkitchen", "virtual_gallery", "gardenspoint"),
+    "kitti_curve",
+)
+ZOOM = 1.6
 # Of the spread of the photos, and degrees.
 RIGHT_SHARE, RIGHT_DEG = 0.02, 2.0
 Make = Callable[[NDArray[np.uint8], Camera], tuple[NDArray[np.uint8], Camera]]
@@ -78,10 +87,13 @@ class Row:
         self.asked += 1
         answer = localizer.localize(read_photo_file(path), camera, LocalizeOptions())
         self.sources[str(answer.evidence.camera_source)] += 1
-        if not isinstance(answer, Localized):
-            return
-        error = answer.cam_from_world.center - truth.center
-        stated = position_covariance(answer.cam_from_world, answer.covariance)
+        if isinstance(answer, Localized):
+            self.add(answer.cam_from_world, answer.covariance, truth)
+
+    def add(self, found: Pose, covariance: NDArray[np.float64], truth: Pose) -> None:
+        """Compare an answer's pose and covariance with the truth."""
+        error = found.center - truth.center
+        stated = position_covariance(found, covariance)
         inside = bool(error @ np.linalg.solve(stated, error) <= chdtri(3, 0.05))
         off = float(np.linalg.norm(error))
         self.found.append((off, off / float(np.sqrt(np.trace(stated))), inside))
@@ -200,6 +212,33 @@ def given(places: Places, scratch: Path) -> Iterator[Row]:
         yield row
 
 
+def sequence(places: Places, _: Path) -> Iterator[Row]:
+    """A focal length so little off that one photo hardly tells: photos alone, and as a sequence."""
+    localizer = localizer_of(places.store.open(SAMPLE))
+    for zoom_by in (1.0, 1.003, 1.005):
+        name = f"focal length {100 * (zoom_by - 1):+.1f} %"
+        solver = SequenceSolver(
+            localizer.geometry,
+            metric=True,
+            options=LocalizeOptions(),
+            time_unit=TimeUnit.S,
+            max_gap_s=0.0,
+        )
+        alone, answers = Row(f"{name}, alone"), []
+        together = Row(f"{name}, in a sequence")
+        for second, (source, camera, truth) in enumerate(_queries(places)):
+            sent = _changed(camera, zoom_by)
+            alone.ask(localizer, source, sent, truth)
+            look = localizer.look(read_photo_file(source), sent, LocalizeOptions())
+            seen = SeenInstant(second, (SeenImage.alone(look),), None, NO_PRIORS)
+            answers += solver.add(seen)
+        for answer, (_, _, truth) in zip(answers + solver.finish(), _queries(places), strict=True):
+            together.asked += 1
+            if answer.pose is not None:
+                together.add(answer.pose.rig_from_world, answer.pose.covariance, truth)
+        yield from (alone, together)
+
+
 # Degrees per second to the right, metres per second to the right and ahead.
 MOTIONS = {
     "still": (0, 0, 0),
@@ -249,6 +288,7 @@ TABLES: dict[str, Callable[[Places, Path], Iterator[Row]]] = {
     "given": given,
     "shutter": shutter,
     "zoom": zoom,
+    "sequence": sequence,
     "exact": exact,
 }
 
@@ -275,33 +315,44 @@ def _poses(dataset: Dataset) -> dict[str, Pose]:
     return found
 
 
-def held_out(places: Places, scratch: Path) -> None:
+def _map_of_photos(name: str, folder: Path, maps: Path) -> Map:
+    """Build a map of photos alone."""
+    dataset = folder.parent / "dataset"
+    write_imported(read_model("images", folder), dataset)
+    sfm = SfmSettings(poses="estimate", refine=("intrinsics",))
+    settings = BuildSettings(dataset, name, maps_dir=maps, method="sfm", sfm=sfm, workers=2)
+    build_map(replace(settings, accept=True), lambda *_: None)
+    return MapStore(maps).open(name)
+
+
+def _known_poses(opened: Map, truth: dict[str, Pose]) -> tuple[dict[str, Pose], Similarity, float]:
+    """Return a map's poses by name, the similarity to the truth, and the spread of the photos."""
+    in_map = {
+        Path(image.name).name: Pose.from_quaternion(row[:4], row[4:])
+        for image, row in zip(opened.images, opened.image_poses, strict=True)
+    }
+    both = [each for each in in_map if each in truth]
+    to_truth = align_poses([in_map[each] for each in both], [truth[each] for each in both])
+    centers = np.array([truth[each].center for each in both])
+    spread = float(np.linalg.norm(centers - np.median(centers, axis=0), axis=1).max())
+    return in_map, to_truth, spread
+
+
+def held_out(places: Places, scratch: Path) -> Iterator[str]:
     """Build maps without every fifth photo, and ask for that."""
+    yield "| photos | placed | without intrinsics | with the map's camera |\n|---|---|---|---|"
     for name in HELD_OUT:
         photos, truth = _photos_alone(name, places)
         names = [str(path).rsplit("records_data/", 1)[-1].replace("/", "_") for path in photos]
         if name == "lund_door":
             names = [path.name for path in photos]
-        folder, maps = scratch / name / "photos", scratch / name / "maps"
+        folder = scratch / name / "photos"
         folder.mkdir(parents=True)
         for number, (path, new) in enumerate(zip(photos, names, strict=True)):
             if number % 5:
                 shutil.copy(path, folder / new)
-        write_imported(read_model("images", folder), scratch / name / "dataset")
-        sfm = SfmSettings(poses="estimate", refine=("intrinsics",))
-        settings = BuildSettings(
-            scratch / name / "dataset", name, maps_dir=maps, method="sfm", sfm=sfm, workers=2
-        )
-        build_map(replace(settings, accept=True), lambda *_: None)
-        opened = MapStore(maps).open(name)
-        in_map = {
-            Path(image.name).name: Pose.from_quaternion(row[:4], row[4:])
-            for image, row in zip(opened.images, opened.image_poses, strict=True)
-        }
-        both = [each for each in in_map if each in truth]
-        to_truth = align_poses([in_map[each] for each in both], [truth[each] for each in both])
-        centers = np.array([truth[each].center for each in both])
-        spread = float(np.linalg.norm(centers - np.median(centers, axis=0), axis=1).max())
+        opened = _map_of_photos(name, folder, scratch / name / "maps")
+        in_map, to_truth, spread = _known_poses(opened, truth)
         camera = next(iter(opened.cameras.values()))
         localizer, told = localizer_of(opened), []
         for sent in (None, camera):
@@ -310,9 +361,43 @@ def held_out(places: Places, scratch: Path) -> None:
                 if new in truth:
                     counts[_rightness(localizer, path, sent, truth[new], to_truth, spread)] += 1
             told.append(", ".join(f"{count} {what}" for what, count in counts.items()))
-        typer.echo(
-            f"| {name} | {len(in_map)} of {len(list(folder.iterdir()))} | {told[0]} | {told[1]} |"
+        yield f"| {name} | {len(in_map)} of {len(list(folder.iterdir()))} | {told[0]} | {told[1]} |"
+
+
+def zoomed_maps(places: Places, scratch: Path) -> Iterator[str]:
+    """Build maps of photos alone, of which every tenth has digital zoom."""
+    yield "| EXIF contains the zoom | photos | placed | with zoom | wrong |\n|---|---|---|---|---|"
+    dataset = read_dataset(places.dataset(SAMPLE, "mapping"))
+    left = [record for record in dataset.images if record.sensor_id == "left"]
+    truth = _poses(dataset)
+    for millimetres, count in ((25, 20), (25, 40), (40, 20), (40, 40)):
+        name = f"zoomed-{millimetres}-{count}"
+        folder = scratch / name / "photos"
+        folder.mkdir(parents=True)
+        zoomed = set()
+        for number, record in enumerate(left[:: max(len(left) // count, 1)][:count]):
+            photo, new = Image.open(dataset.path_of(record)), record.path.replace("/", "_")
+            tags: dict[str, float] = {"FocalLengthIn35mmFilm": 25}
+            if number % 10 == 5:
+                zoomed.add(new)
+                w, h = photo.size
+                inset = (w - w / ZOOM) / 2, (h - h / ZOOM) / 2
+                photo = photo.resize((w, h), box=(*inset, w - inset[0], h - inset[1]))
+                tags = {"FocalLengthIn35mmFilm": millimetres, "DigitalZoomRatio": ZOOM}
+            _with_exif(photo, folder / new, **tags)
+        in_map, to_truth, spread = _known_poses(_map_of_photos(name, folder, scratch), truth)
+        wrong = sum(
+            not _is_right(to_truth.move(pose), truth[each], spread) for each, pose in in_map.items()
         )
+        contains = "yes" if millimetres == 40 else "no"
+        placed = sum(each in zoomed for each in in_map)
+        yield f"| {contains} | {count} | {len(in_map)} | {placed} of {len(zoomed)} | {wrong} |"
+
+
+def _is_right(found: Pose, truth: Pose, spread: float) -> bool:
+    off = float(np.linalg.norm(found.center - truth.center)) / spread
+    turned = np.degrees(rotation_angle(found.rotation @ truth.rotation.T))
+    return bool(off <= RIGHT_SHARE and turned <= RIGHT_DEG)
 
 
 def _rightness(
@@ -328,12 +413,17 @@ def _rightness(
         return "refused"
     there = to_truth.move(answer.cam_from_world)
     off = float(np.linalg.norm(there.center - truth.center)) / spread
-    turned = np.degrees(rotation_angle(there.rotation @ truth.rotation.T))
-    return "right" if off <= RIGHT_SHARE and turned <= RIGHT_DEG else f"wrong by {off:.1%}"
+    return "right" if _is_right(there, truth, spread) else f"wrong by {off:.1%}"
+
+
+MAPS: dict[str, Callable[[Places, Path], Iterator[str]]] = {
+    "held-out": held_out,
+    "zoomed-maps": zoomed_maps,
+}
 
 
 def main(
-    tables: Annotated[list[str], typer.Argument(help=f"Of {', '.join(TABLES)}, held-out.")],
+    tables: Annotated[list[str], typer.Argument(help=f"Of {', '.join([*TABLES, *MAPS])}.")],
     data: Annotated[Path, typer.Option(help="The shared data sets.")] = Path("../shared/data"),
     maps: Annotated[Path, typer.Option(help="A store of maps.")] = Path(".trust/maps"),
 ) -> None:
@@ -343,10 +433,9 @@ def main(
     make_missing(places, needed, lambda line: typer.echo(line, err=True))
     with TemporaryDirectory() as scratch:
         for table in tables:
-            if table == "held-out":
-                typer.echo("\n| photos | placed | without intrinsics | with the map's camera |")
-                typer.echo("|---|---|---|---|")
-                held_out(places, Path(scratch))
+            if table in MAPS:
+                for line in MAPS[table](places, Path(scratch)):
+                    typer.echo(line)
                 continue
             typer.echo(
                 "\n| queries | camera | answered | median error, cm | largest | error / stated "

@@ -11,7 +11,11 @@ from numpy.typing import NDArray
 from visloc.errors import VislocError, refuse
 from visloc.geometry import Camera, Pose
 from visloc.localization.acceptance.camera_check import only_focal_length_contradicts
-from visloc.localization.acceptance.corrected_cameras import with_corrected_cameras
+from visloc.localization.acceptance.corrected_cameras import (
+    NO_CAMERAS,
+    CamerasSoFar,
+    with_corrected_cameras,
+)
 from visloc.localization.acceptance.evidence import Shown
 from visloc.localization.acceptance.gates import Problem, accepted, not_better_elsewhere
 from visloc.localization.acceptance.judge import not_probable_enough
@@ -133,12 +137,14 @@ class Solved:
         pose: the accepted pose, relative to the map's origin; None when there is none.
         inliers: of each view, (n,) whether the best pose explains the match, even if it was
             refused; () when no pose was found.
+        cameras: what this instant and those before say of their cameras.
     """
 
     answer: InstantAnswer
     views: tuple[MatchedView, ...]
     pose: GeneralizedPose | None
     inliers: tuple[NDArray[np.bool_], ...]
+    cameras: CamerasSoFar
 
     def refused(self, refusal: Refusal) -> Solved:
         """Return the same without its pose."""
@@ -151,6 +157,7 @@ def solve_instant(
     options: LocalizeOptions,
     priors: Priors,
     timestamp: int | None = None,
+    cameras: CamerasSoFar = NO_CAMERAS,
 ) -> Solved:
     """Find one pose from all images of an instant; a photo on its own is a rig of one camera.
 
@@ -165,6 +172,7 @@ def solve_instant(
         options: those that the images were matched with.
         priors: what is known of the rig.
         timestamp: for the answer.
+        cameras: what earlier instants of a sequence said of their cameras.
 
     Raises:
         InvalidInput: ``priors.*`` that mean nothing in this map; ``options.solver`` for several
@@ -200,7 +208,8 @@ def solve_instant(
             place, refusal, scores = stronger_place(problem, geometry, proposed, found)
             found, refusal = (place, refusal) if place is found else accepted(problem, place)
         if refusal is None and found is not None:
-            problem, found = with_corrected_cameras(problem, found)
+            sensors = [image.sensor for image in images if image.look is not None]
+            problem, found, cameras = with_corrected_cameras(problem, found, sensors, cameras)
             found, refusal = with_redraws(problem, found, geometry.reach)
         refusal = refusal and _with_turned_photos(refusal, looks)
     pose = None
@@ -214,7 +223,7 @@ def solve_instant(
     shown = with_inliers(_shown(images, used, estimated is not None), inliers)
     coarse = looks[0].coarse if len(looks) == 1 else None
     answer = InstantAnswer(timestamp, shown, pose, refusal, seconds, scores, coarse)
-    solved = Solved(answer, views, found if refusal is None else None, inliers)
+    solved = Solved(answer, views, found if refusal is None else None, inliers, cameras)
     refusal = not_probable_enough(answer, options)
     return solved if refusal is None else solved.refused(refusal)
 

@@ -38,8 +38,11 @@ FOCAL, SHIFT_X, SHIFT_Y, RADIAL = range(4)
 _SHUTTER = slice(4, 10)
 _PARTS = 10
 # Each has a prior of its own, but both coordinates of the principal point share one.
+_LENS = np.arange(4)  # the parts that a camera has in all its photos
 _FIRSTS = np.array([FOCAL, SHIFT_X, RADIAL, *range(4, 10)])
 _SIZES = np.array([1, 2, *[1] * 7])
+# Photos of one place repeat the errors of its landmarks, so the earlier of them fade.
+_KEPT = 0.9
 # Standard deviations by which the photo must say that a part is off. From the second on the part is
 # corrected; between both, its change only adds to the uncertainty of the pose.
 _MAYBE, _SURE = 1.0, 2.5
@@ -93,6 +96,26 @@ PRIORS = {
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class LensEvidence:
+    """What photos say of the change of a camera's lens; their poses and shutters are eliminated.
+
+    Attributes:
+        information: (4, 4)
+        vector: (4,), the information times the best change.
+    """
+
+    information: NDArray[np.float64]
+    vector: NDArray[np.float64]
+
+    def with_earlier(self, earlier: LensEvidence | None) -> LensEvidence:
+        """Return what this photo and the earlier ones say to a later one."""
+        before = (0.0, 0.0) if earlier is None else (earlier.information, earlier.vector)
+        return LensEvidence(
+            _KEPT * (self.information + before[0]), _KEPT * (self.vector + before[1])
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class CameraErrors:
     """A rig's pose with cameras that may be off.
 
@@ -102,12 +125,14 @@ class CameraErrors:
         corrected: whether any view was.
         of_camera: (6, 6), what is left of the cameras' errors in ``rig_from_world``, rotation (rad)
             then translation, for R <- Exp(w) R and t <- t + dt.
+        evidence: of each view alone; None of one without inliers.
     """
 
     rig_from_world: Pose
     views: tuple[MatchedView, ...]
     corrected: bool
     of_camera: NDArray[np.float64]
+    evidence: tuple[LensEvidence | None, ...]
 
 
 def find_camera_errors(
@@ -115,6 +140,7 @@ def find_camera_errors(
     priors: Sequence[CameraPrior],
     rig_from_world: Pose,
     *,
+    earlier: Sequence[LensEvidence | None] | None = None,
     max_error_px: float,
     factor: float,
 ) -> CameraErrors | None:
@@ -124,6 +150,7 @@ def find_camera_errors(
         views: what each camera sees, with all its matches; some may have none.
         priors: of the camera of each view.
         rig_from_world: the best pose with the cameras as they are.
+        earlier: what earlier photos said of the camera of each view.
         max_error_px: largest reprojection error of an inlier.
         factor: by how much poses in the map are further off than the scatter of matches tells.
 
@@ -135,6 +162,7 @@ def find_camera_errors(
     seen = [each for each in near if each is not None]
     if not seen:
         return None
+    said = [earlier[row] if earlier else None for row in used]
     right, wrong = (
         np.concatenate([_by_part(prior) for prior in each])
         for each in zip(*((priors[row].right, priors[row].wrong) for row in used), strict=True)
@@ -144,7 +172,7 @@ def find_camera_errors(
         normal = _normal_equations(seen, pose, change, wrong, width, max_error_px, factor)
         if normal is None:
             return None
-        found = _relevant(normal, change, right, wrong)
+        found = _relevant(normal.after(said), right, wrong)
         if width == 1.0 and not found.off.any() and (right <= _RIGHT).all():
             pose, change = rig_from_world, np.zeros(len(right))
             break  # as most given cameras are
@@ -158,7 +186,10 @@ def find_camera_errors(
         for row, each, parts in zip(used, seen, change.reshape(-1, _PARTS), strict=True):
             corrected[row] = _corrected(views[row], each.depth, pose, parts)
     of_camera = (of_camera + of_camera.T) / 2
-    return CameraErrors(pose, tuple(corrected), bool(change.any()), of_camera)
+    evidence: list[LensEvidence | None] = [None] * len(views)
+    for number, row in enumerate(used):
+        evidence[row] = normal.lens(number, right)
+    return CameraErrors(pose, tuple(corrected), bool(change.any()), of_camera, tuple(evidence))
 
 
 def _by_part(stds: tuple[float, float, float, float]) -> NDArray[np.float64]:
@@ -192,11 +223,32 @@ class _Normal:
 
     Attributes:
         information: (k, k), with the errors that landmarks share.
-        gradient: (k,)
+        target: (k,), the information times the step of the pose and the change of the cameras.
     """
 
     information: NDArray[np.float64]
-    gradient: NDArray[np.float64]
+    target: NDArray[np.float64]
+
+    def lens(self, number: int, right: NDArray[np.float64]) -> LensEvidence:
+        """Return what the equations say of one of the cameras, with the others as they are."""
+        first = 6 + _PARTS * number
+        lens, rest = _LENS + first, np.r_[:6, np.arange(_PARTS)[_SHUTTER] + first]
+        of_rest = (self.information + _inverse_variances(right))[np.ix_(rest, rest)]
+        by_rest = np.linalg.solve(of_rest, self.information[np.ix_(rest, lens)]).T
+        return LensEvidence(
+            self.information[np.ix_(lens, lens)] - by_rest @ self.information[np.ix_(rest, lens)],
+            self.target[lens] - by_rest @ self.target[rest],
+        )
+
+    def after(self, earlier: Sequence[LensEvidence | None]) -> _Normal:
+        """Return the equations with what earlier photos said of the cameras."""
+        information, target = self.information.copy(), self.target.copy()
+        for number, said in enumerate(earlier):
+            if said is not None:
+                lens = _LENS + 6 + _PARTS * number
+                information[np.ix_(lens, lens)] += said.information
+                target[lens] += said.vector
+        return _Normal(information, target)
 
 
 def _normal_equations(
@@ -248,7 +300,7 @@ def _normal_equations(
     each = np.einsum("ian,na->ni", weighted, error)
     shared = _shared(information, free, each, np.concatenate(cells), variance)
     variance *= factor**2 * shared
-    return _Normal(information / variance, gradient / variance)
+    return _Normal(information / variance, (information[:, 6:] @ change - gradient) / variance)
 
 
 def _inverse_variances(stds: NDArray[np.float64], scale: float = 1.0) -> NDArray[np.float64]:
@@ -305,17 +357,14 @@ class _Relevant:
 
 def _relevant(
     normal: _Normal,
-    change: NDArray[np.float64],
     right: NDArray[np.float64],
     wrong: NDArray[np.float64],
 ) -> _Relevant:
     """Find which parts are off, by how much, and the pose's step with it."""
-    target = normal.information[:, 6:] @ change - normal.gradient
-
     def solved(stds: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         inverse = np.linalg.inv(normal.information + _inverse_variances(stds))
         covariance = np.asarray(inverse, np.float64)
-        return covariance @ target, covariance
+        return covariance @ normal.target, covariance
 
     stds = wrong
     for _ in range(_MOST_UPDATES):

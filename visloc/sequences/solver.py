@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from visloc.errors import refuse
 from visloc.geometry import center_covariance, covariance_from_center, rotation_angle
+from visloc.localization.acceptance.corrected_cameras import NO_CAMERAS
 from visloc.localization.acceptance.gates import contradicts_priors, registration_for
 from visloc.localization.acceptance.judge import not_probable_enough
 from visloc.localization.geometry.constraints import Constraints, MapGeometry
@@ -122,6 +123,7 @@ class SequenceSolver:
         self._entries: list[_Entry] = []  # answered ones that still help, then those that wait
         self._num_answered = 0
         self._readings = ALL_READINGS  # of the odometry, that fit the photos so far
+        self._cameras = NO_CAMERAS
         self._rest = 0  # instants to come before a window without any pose is searched again
 
     @property
@@ -151,6 +153,7 @@ class SequenceSolver:
             self._options.before_rivals(),
             seen.priors,
             seen.timestamp,
+            cameras=self._cameras,
         )
 
     def take(self, seen: SeenInstant, solved: Solved) -> list[InstantAnswer]:
@@ -158,6 +161,8 @@ class SequenceSolver:
         refusal = not_probable_enough(solved.answer, self._options)
         if refusal is not None:
             solved = solved.refused(refusal)
+        if solved.pose is not None:
+            self._cameras = solved.cameras
         if self._first_timestamp is None:
             self._first_timestamp = seen.timestamp
         ticks = seen.timestamp - self._first_timestamp

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from visloc.geometry import Camera, Pose
-from visloc.pose.camera_errors import PRIORS, CameraErrors, find_camera_errors
+from visloc.pose.camera_errors import PRIORS, CameraErrors, LensEvidence, find_camera_errors
 from visloc.pose.centre import position_covariance
 from visloc.pose.colmap import project
 from visloc.pose.generalized import refine_generalized_pose
@@ -21,6 +21,7 @@ TRUE = Camera("PINHOLE", 640, 480, (460.0, 460.0, 322.0, 238.0))
 POSE = Pose.from_quaternion(np.array([0.98, 0.05, 0.18, -0.03]), np.array([0.3, -0.2, 0.5]))
 GIVEN = PRIORS[CameraSource.GIVEN]
 NOISE_PX, MAX_ERROR_PX = 0.4, 12.0
+FACTOR = 20.0  # with which one photo does not tell 0.8 % of a focal length
 # A turn and a walk while the rows are read.
 MOTION = np.array([0.0, 0.01, 0.0, 0.03, 0.0, 0.0])
 
@@ -49,11 +50,18 @@ def seen(
     return MatchedView(told, Pose.identity(), exact + random.normal(0, NOISE_PX, (900, 2)), points)
 
 
-def found_in(view: MatchedView, factor: float = 1.0) -> CameraErrors:
+def found_in(
+    view: MatchedView, factor: float = 1.0, earlier: LensEvidence | None = None
+) -> CameraErrors:
     best = refine_generalized_pose([view], POSE, max_error_px=MAX_ERROR_PX)
     assert best is not None
     found = find_camera_errors(
-        [view], [GIVEN], best.rig_from_world, max_error_px=MAX_ERROR_PX, factor=factor
+        [view],
+        [GIVEN],
+        best.rig_from_world,
+        earlier=[earlier],
+        max_error_px=MAX_ERROR_PX,
+        factor=factor,
     )
     assert found is not None
     return found
@@ -111,6 +119,34 @@ def test_errors_that_the_landmarks_share_take_the_say_from_the_photo() -> None:
     view = seen(0, told=WRONG["focal length 2 % too long"])
     assert found_in(view).corrected
     assert not found_in(view, factor=200.0).corrected
+
+
+@pytest.mark.parametrize(
+    ("told", "corrected"), [(changed(fx=3.7, fy=3.7), True), (TRUE, False)], ids=["wrong", "right"]
+)
+def test_several_photos_of_a_camera_say_more_than_one(told: Camera, corrected: bool) -> None:
+    told_by_one, earlier, found = 0, None, None
+    for seed in range(8):
+        view = seen(seed, told=told)
+        told_by_one += found_in(view, factor=FACTOR).corrected
+        found = found_in(view, FACTOR, earlier)
+        (evidence,) = found.evidence
+        assert evidence is not None
+        earlier = evidence.with_earlier(earlier)
+    assert found is not None
+    assert told_by_one == 0
+    assert found.corrected is corrected
+    assert found.views[0].camera.focal_length == pytest.approx(460, rel=0.003)
+
+
+def test_evidence_of_earlier_photos_fades() -> None:
+    (evidence,) = found_in(seen(0)).evidence
+    assert evidence is not None
+    kept = None
+    for _ in range(200):
+        kept = evidence.with_earlier(kept)
+    assert kept is not None
+    np.testing.assert_allclose(kept.information, 9 * evidence.information, rtol=1e-6)
 
 
 def test_wall_parallel_to_the_picture_does_not_tell_the_focal_length() -> None:

@@ -14,6 +14,7 @@ from visloc.errors import InvalidInput
 from visloc.geometry import Camera, Pose, center_covariance
 from visloc.localization.solving import Matches, SeenImage, solve_instant
 from visloc.options import LocalizeOptions
+from visloc.pose.map_errors import MapErrors
 from visloc.priors import NO_PRIORS, HeightBand, PositionPrior, Priors
 from visloc.sequences import solver as sequence_module
 from visloc.sequences.filling import MAX_GAP_S, Odometry, TimeUnit
@@ -181,13 +182,16 @@ def patterns(draw: st.DrawFn) -> tuple[list[tuple[str, str, int]], float]:
 
 
 class Remembering:
-    """``solve_instant`` that solves each instant once, however many sequences it is in."""
+    """``solve_instant`` that solves each instant once, however many sequences it is in.
+
+    So no instant learns of the cameras of those before.
+    """
 
     def __init__(self, place: Any) -> None:
         self.place = place
         self.solved: dict[tuple[int, ...], Any] = {}
 
-    def __call__(self, images: Any, *arguments: Any) -> Any:
+    def __call__(self, images: Any, *arguments: Any, cameras: Any) -> Any:  # noqa: ARG002
         key = tuple(id(image) for image in images)
         if key not in self.solved:
             self.solved[key] = solve_instant(images, *arguments)
@@ -886,3 +890,43 @@ def test_a_window_without_any_pose_is_not_searched_again_for_every_instant(
     answers = answers_to(solver(here, 1.0), instants_of(here, "b" * 45, moving=True))
     assert sources(answers) == "-" * 45
     assert len(searched) <= 6
+
+
+# Cameras that are off
+
+
+OFF = 1.006
+
+
+def with_focal_length(image: SeenImage, factor: float) -> SeenImage:
+    """The same image, with another camera told than took it."""
+    assert image.look is not None
+    fx, fy, cx, cy = image.look.camera.params
+    camera = replace(image.look.camera, params=(factor * fx, factor * fy, cx, cy))
+    evidence = replace(image.look.evidence, camera=camera)
+    return replace(image, look=replace(image.look, evidence=evidence))
+
+
+def test_photos_of_a_camera_together_correct_what_none_of_them_tells_alone(place: Any) -> None:
+    images = [
+        with_focal_length(place.image(place.matches(rig_at(i), 60, seed=i)), OFF) for i in range(12)
+    ]
+    geometry = place.geometry
+    geometry.errors = MapErrors(position_factor=4.0, orientation_factor=4.0)
+
+    def solving() -> SequenceSolver:
+        return SequenceSolver(
+            geometry, metric=True, options=OPTIONS, time_unit=TimeUnit.MS, max_gap_s=0.0
+        )
+
+    sequence = solving()
+    alone, together = [], []
+    for i, image in enumerate(images):
+        seen = SeenInstant(100 * i, (image,), None, NO_PRIORS)
+        alone.append(solving().solve(seen).answer)
+        together += sequence.add(seen)
+    true = place.camera.focal_length
+    for answers, expected in ((alone, OFF * true), (together, true)):
+        evidence = answers[-1].images[0].evidence
+        assert evidence is not None
+        assert evidence.camera.focal_length == pytest.approx(expected, rel=0.002)
