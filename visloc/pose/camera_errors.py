@@ -361,6 +361,7 @@ def _relevant(
     wrong: NDArray[np.float64],
 ) -> _Relevant:
     """Find which parts are off, by how much, and the pose's step with it."""
+
     def solved(stds: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         inverse = np.linalg.inv(normal.information + _inverse_variances(stds))
         covariance = np.asarray(inverse, np.float64)
