@@ -81,7 +81,7 @@ class CameraPrior:
     wrong: tuple[float, float, float, float]
 
 
-_GIVEN = CameraPrior((0.0003, 0.0003, 0.001, 0.0003), (0.05, 0.03, 0.2, 0.03))
+_GIVEN = CameraPrior((0.001, 0.0003, 0.001, 0.0003), (0.05, 0.03, 0.2, 0.03))
 # EXIF rounds to whole millimetres, lenses breathe, and phones stabilize.
 _EXIF = CameraPrior((0.03, 0.01, 0.01, 0.0003), (0.05, 0.03, 0.2, 0.03))
 _ESTIMATED = CameraPrior((0.3, 0.01, 0.01, 0.0003), (0.5, 0.03, 0.2, 0.03))
