@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncGenerator, AsyncIterator
-from contextlib import aclosing, asynccontextmanager
+from contextlib import aclosing, asynccontextmanager, suppress
 from typing import Any
 
 import h11
@@ -71,8 +71,14 @@ class TimelyProtocol(H11Protocol, Connection):
         self.conn = LargeChunks(h11.SERVER, _MAX_HEAD_BYTES)
 
     def send_400_response(self, msg: str) -> None:
+        if self.cycle is not None and not self.cycle.response_complete:
+            # The app must not answer too: it has not even begun, where all came in one packet.
+            self.cycle.disconnected = True
+            self.cycle.message_event.set()
         if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):
-            super().send_400_response(msg)
+            with suppress(h11.LocalProtocolError):  # of HEAD: its answer has no body
+                super().send_400_response(msg)
+            self.transport.close()
         else:  # the answer had begun before the error
             self.transport.abort()
 
