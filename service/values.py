@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -291,6 +292,20 @@ class SequenceStep(NamedTuple):
     maps: tuple[str, ...]
     answers: list[Localization]
     pose: RigPose | None
+
+
+class Signals(ctypes.Structure):
+    """What the main process and a worker process tell each other during a task, in shared memory.
+
+    Attributes:
+        abandoned: nobody waits for the task any more; the main process sets it.
+        opening: a map is being opened; the worker process sets it, until the task ends if that
+            fails.
+    """
+
+    abandoned: bool
+    opening: bool
+    _fields_ = (("abandoned", ctypes.c_bool), ("opening", ctypes.c_bool))
 
 
 class Abandoned(Exception):

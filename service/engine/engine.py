@@ -16,6 +16,7 @@ from service.engine.set_sequences import SetSequence
 from service.engine.sets import SetSearch, answers_of, parted
 from service.engine.uploads import Uploads
 from service.errors import stopping_error
+from service.telemetry.logs import current_request
 from service.telemetry.metrics import Metrics
 from service.values import (
     InstantJob,
@@ -87,6 +88,7 @@ class Engine:
             limit_s=limit_s,
             warm=lambda: self._catalog.known,
             on_death=metrics.observe_worker_death,
+            on_overdue=self._note_overdue,
         )
         self._catalog = Catalog(store, self.workers)
         self.scenes = Scenes(self._catalog)
@@ -340,6 +342,10 @@ class Engine:
         """
         with self._noted("delete"):
             await self._catalog.delete(map_id, version, self._limit_s)
+
+    def _note_overdue(self) -> None:
+        request = current_request()
+        self._metrics.observe_worker_ended(None if request is None else request.key)
 
     @contextmanager
     def _noted(self, change: str) -> Iterator[None]:

@@ -27,6 +27,8 @@ LOCALIZED = "localized"
 # Maps after the first MAX_MAPS share one label, so that uploads cannot fill Prometheus.
 MAX_MAPS = 200
 OTHER_MAPS = "(others)"
+# The label of callers without a key, which a service without keys has.
+NO_KEY = "(none)"
 
 _HELP = "help"
 LabelsT = TypeVar("LabelsT", bound=tuple[str, ...])
@@ -133,7 +135,13 @@ class Metrics:
             "visloc_uploaded_bytes", "Bytes of packed maps received, kept or not."
         )
         self._worker_deaths = counter(
-            "visloc_worker_deaths", "Worker processes that died and were replaced."
+            "visloc_worker_deaths", "Worker processes that died by themselves and were replaced."
+        )
+        self._workers_ended = counter(
+            "visloc_workers_ended",
+            "Worker processes ended, and replaced, because they went on with a request after its"
+            " deadline or after its caller had left, by API key.",
+            ("key",),
         )
         self._start_at_zero()
 
@@ -200,6 +208,10 @@ class Metrics:
 
     def observe_worker_death(self) -> None:
         self._worker_deaths.inc()
+
+    def observe_worker_ended(self, key: str | None) -> None:
+        """Count a worker process that was ended because of a request with this API key."""
+        self._workers_ended.labels(key or NO_KEY).inc()
 
     def render(self, state: ServiceState) -> tuple[bytes, str]:
         """Return the text of a scrape and its content type. Reads disks: not for the event loop."""

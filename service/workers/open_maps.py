@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from functools import partial
 from time import perf_counter
 
-from service.values import MapFolder, OpenMap, WorkerSettings
+from service.values import Abandoned, MapFolder, OpenMap, Signals, WorkerSettings
 from service.workers.tiles import TileRanker, resolution_beside
 from visloc.archive.store import open_published, open_published_set
 from visloc.errors import Conflict, InvalidInput, VislocError, refuse
@@ -29,8 +29,9 @@ logger = logging.getLogger(__name__)
 class OpenMaps:
     """Opens maps and sets when they are asked for, and closes the least recently used ones."""
 
-    def __init__(self, settings: WorkerSettings) -> None:
+    def __init__(self, settings: WorkerSettings, signals: Signals) -> None:
         self._settings = settings
+        self._signals = signals
         # The most recently used last.
         self._opened: OrderedDict[str, Localizer | TileRanker] = OrderedDict()
         # By name, shared by all maps.
@@ -60,14 +61,19 @@ class OpenMaps:
             Conflict: the map's features are not installed.
             MapCorrupt: the map cannot be used.
             NotFound: ``map.version``: it was removed.
+            Abandoned: nobody waits any more; the map stays open.
         """
         found = self._opened.get(version.ref)
         if found is None:
+            self._signals.opening = True
             found = self._opened[version.ref] = self._open(version)
         self._opened.move_to_end(version.ref)
         while len(self._opened) > 1 and self._size > self._settings.max_loaded_bytes:
             ref, _ = self._opened.popitem(last=False)
             logger.info("map %s closed, to stay within max_loaded_bytes", ref)
+        if self._signals.abandoned:
+            raise Abandoned
+        self._signals.opening = False
         return found
 
     def try_out(self, version: MapFolder) -> None:

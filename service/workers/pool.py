@@ -11,14 +11,13 @@ from __future__ import annotations
 
 import asyncio
 import atexit
-import ctypes
 import logging
 import pickle
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from contextvars import ContextVar
+from contextvars import Context, ContextVar, copy_context
 from dataclasses import dataclass, field
 from heapq import heapify, heappop, heappush
 from itertools import count as numbers
@@ -31,7 +30,7 @@ from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 
 from service.errors import stopping_error
 from service.machine import usable_cores
-from service.values import MapFolder, OpenMap, WorkerSettings
+from service.values import MapFolder, OpenMap, Signals, WorkerSettings
 from service.workers import process
 from service.workers.tasks import Vision
 from visloc.errors import Unavailable, VislocError, refuse
@@ -49,8 +48,11 @@ FORK_SERVER = "service.workers.forkserver"
 _WATCH_S = 1.0
 # Pause before a worker that cannot start is tried again.
 _RESTART_PAUSE_S = 1.0
-# Longest time for a process to begin and to open the maps that are in service.
+# Longest time for a process to begin, and for it to open a map that is in service.
 _START_LIMIT_S = 300.0
+# How long a process may go on with a task that nobody waits for any more, until its next step. A
+# new process takes about as long to begin (docs/decisions/0057-abandoned-workers.md).
+_STEP_LIMIT_S = 1.0
 _PING = methodcaller(str(Vision.ping))
 # The seconds by which a request falls back in the queue for each second that workers spent on it.
 # Twice as many as there are sequences at once by default: all together then take at most half of a
@@ -107,7 +109,11 @@ def using_turn(turn: Turn) -> Iterator[None]:
 
 @dataclass(order=True)
 class _Queued:
-    """A task, the future of its result, and the worker that runs it now; the least comes first."""
+    """A task, the future of its result, and the worker that runs it now; the least comes first.
+
+    Attributes:
+        context: of the request.
+    """
 
     rank: float
     number: int
@@ -115,6 +121,7 @@ class _Queued:
     task: Task[Any] = field(compare=False)
     answer: asyncio.Future[Any] = field(compare=False)
     worker: _Worker | None = field(default=None, compare=False)
+    context: Context = field(default_factory=copy_context, compare=False)
 
 
 class Workers:
@@ -123,8 +130,11 @@ class Workers:
     Args:
         count: processes.
         limit_s: longest time that one task may take; a process that exceeds it is replaced.
-        warm: the maps that may be open; a new process opens those that its predecessor had open.
-        on_death: called for every process that died.
+        warm: the maps that may be open; a new process opens those that its predecessor had open,
+            while no task waits.
+        on_death: called for every process that died by itself.
+        on_overdue: called for every process that was ended because it went on with a request after
+            its deadline, or after its caller had left; in the context of that request.
     """
 
     def __init__(
@@ -135,6 +145,7 @@ class Workers:
         limit_s: float,
         warm: Callable[[], Sequence[MapFolder]],
         on_death: Callable[[], None],
+        on_overdue: Callable[[], None],
     ) -> None:
         self._workers = [_Worker(settings) for _ in range(count)]
         self._most_threads = settings.threads
@@ -142,6 +153,7 @@ class Workers:
         self._limit_s = limit_s
         self._warm = warm
         self._on_death = on_death
+        self._on_overdue = on_overdue
         self._queue: list[_Queued] = []  # a heap
         self._numbers = numbers()
         self._changed = asyncio.Condition()
@@ -184,7 +196,7 @@ class Workers:
         Raises:
             Unavailable: ``server.worker_died`` when a process cannot be started.
         """
-        await asyncio.gather(*(one.start(()) for one in self._workers))
+        await asyncio.gather(*(one.start() for one in self._workers))
         self._serving = [asyncio.create_task(self._serve(one)) for one in self._workers]
 
     async def run(
@@ -192,7 +204,8 @@ class Workers:
     ) -> T:
         """Run a task in the next free worker. Cancelling the caller cancels the task.
 
-        A task that has not begun is then dropped; a running one ends at its next step.
+        A task that has not begun is then dropped; a running one ends at its next step. If that
+        takes too long, its process is ended.
 
         Raises:
             Unavailable: ``server.worker_died``; ``server.stopping`` after ``close``.
@@ -269,10 +282,13 @@ class Workers:
         """Give one process its tasks, and replace it when it dies."""
         while True:
             queued = await self._next(one)
-            if queued is None:  # idle for a while: is it still there?
-                await one.ping(self._limit_s)
-            elif not queued.answer.done():
-                await self._work_on(one, queued)
+            if queued is not None:
+                if not queued.answer.done():
+                    await self._work_on(one, queued)
+            elif one.unopened:
+                await self._open_next(one)
+            else:  # idle for a while: is it still there?
+                await one.do(self._limit_s, _PING)
             if not one.alive:
                 await self._replace(one)
 
@@ -294,9 +310,21 @@ class Workers:
         finally:
             queued.turn.worked(monotonic() - started)
             queued.worker = None  # it may take another task before the caller sees the result
+            if one.overdue:
+                queued.context.run(self._note_overdue, one.pid)
+
+    async def _open_next(self, one: _Worker) -> None:
+        """Open one of the maps that the process before had open, if it is served still."""
+        ref = one.unopened.popleft()
+        for version in self._warm():
+            if version.ref == ref:
+                await one.do(_START_LIMIT_S, methodcaller(str(Vision.warm), version))
+                return
 
     async def _next(self, one: _Worker) -> _Queued | None:
-        """Wait for a task; return None when there is none for a while."""
+        """Wait for a task; return None when there is none for a while, or now but maps to open."""
+        if one.unopened and not (one.errands or self._queue):
+            return None
         try:
             async with asyncio.timeout(_WATCH_S), self._changed:
                 await self._changed.wait_for(lambda: one.errands or self._queue)
@@ -306,13 +334,18 @@ class Workers:
         except TimeoutError:
             return None
 
+    def _note_overdue(self, pid: int) -> None:
+        logger.warning("worker process %s was ended: nobody waited for its task any more", pid)
+        self._on_overdue()
+
     async def _replace(self, one: _Worker) -> None:
-        self._on_death()
-        while True:
+        if not one.overdue:
             logger.error("worker process %s died; starting another", one.pid)
+            self._on_death()
+        one.unopened.extendleft(opened.ref for opened in reversed(one.open_maps))
+        while True:
             try:
-                before = {opened.ref for opened in one.open_maps}
-                await one.start([each for each in self._warm() if each.ref in before])
+                await one.start()
             except VislocError as error:
                 logger.error("a worker process cannot start: %s", error)  # noqa: TRY400
                 await asyncio.sleep(_RESTART_PAUSE_S)
@@ -341,15 +374,18 @@ class _Worker:
         # has loaded the libraries and used none, so that a new process begins at once.
         self._context = get_context("forkserver")
         self._context.set_forkserver_preload([FORK_SERVER])
-        # Not an Event: its lock stays locked when a process is killed while it reads the event.
-        self._abandoned = self._context.RawValue(ctypes.c_bool, False)
+        # No Events: their locks stay locked when a process is killed while it reads one.
+        self._signals = self._context.RawValue(Signals)
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="worker")
         self._process: ForkServerProcess | None = None
         self._connection: Connection | None = None
         self.pid = 0
         self.alive = False
         self.busy = False
+        self.overdue = False  # it was ended because it went on for too long
+        self._overdue_at: asyncio.TimerHandle | None = None
         self.open_maps: tuple[OpenMap, ...] = ()
+        self.unopened: deque[str] = deque()  # what processes before had open, not yet in this one
         self.errands: deque[_Queued] = deque()
 
     @property
@@ -358,16 +394,15 @@ class _Worker:
         started = self._process  # the thread may take it away meanwhile
         return started is not None and started.is_alive()
 
-    async def start(self, maps: Sequence[MapFolder]) -> None:
-        """Start a process and open maps in it; it logs those that cannot be opened.
+    async def start(self) -> None:
+        """Start a process.
 
         Raises:
             Unavailable: ``server.worker_died``.
         """
         loop = asyncio.get_running_loop()
         self._kill()
-        self._abandoned.value = False
-        self.pid, self.alive = 0, True
+        self.pid, self.alive, self.overdue = 0, True, False
         try:
             # The first process waits for the fork server, which loads libraries first.
             self.pid = await loop.run_in_executor(self._thread, self._begin)
@@ -375,8 +410,7 @@ class _Worker:
             self.alive = False
             logger.error("no process can be started: %s", error)  # noqa: TRY400
             raise _died() from None
-        warm = methodcaller(str(Vision.warm), tuple(maps))
-        await self._call(_START_LIMIT_S, warm, self._settings.threads)
+        await self._call(_START_LIMIT_S, _PING, self._settings.threads)
 
     async def run(self, limit_s: float, task: Task[T], threads: int) -> T:
         """Run a task with so many threads.
@@ -385,22 +419,34 @@ class _Worker:
             Unavailable: ``server.worker_died``.
             TimedOut: ``server.deadline``; the process is killed.
         """
-        self._abandoned.value = False
         self.busy = True
         try:
             return await self._call(limit_s, task, threads)
         finally:
             self.busy = False
+            if self._overdue_at is not None:
+                self._overdue_at.cancel()
 
-    async def ping(self, limit_s: float) -> None:
-        """Find out whether the process answers; it does not count as busy meanwhile."""
+    async def do(self, limit_s: float, task: Task[Any]) -> None:
+        """Run a task of no request, during which the process does not count as busy."""
         with suppress(VislocError):
-            await self._call(limit_s, _PING, self._settings.threads)
+            await self._call(limit_s, task, self._settings.threads)
 
     def abandon(self) -> None:
-        """Tell the process that nobody waits for its task."""
+        """Tell the process that nobody waits for its task, and end it if it goes on."""
         if self.busy:
-            self._abandoned.value = True
+            self._signals.abandoned = True
+            self._end_at(_STEP_LIMIT_S)
+
+    def _end_at(self, seconds: float) -> None:
+        self._overdue_at = asyncio.get_running_loop().call_later(seconds, self._end_overdue)
+
+    def _end_overdue(self) -> None:
+        if self._signals.opening:  # else a map that takes longer to open never would be
+            self._end_at(_STEP_LIMIT_S)
+        else:
+            self.overdue = True
+            self._kill()
 
     async def stop(self) -> None:
         """End the process, even if it hangs."""
@@ -410,9 +456,11 @@ class _Worker:
 
     async def _call(self, limit_s: float, task: Task[T], threads: int) -> T:
         loop = asyncio.get_running_loop()
+        self._signals.abandoned = self._signals.opening = False
         asked = loop.run_in_executor(self._thread, self._ask, task, threads)
         done, _ = await asyncio.wait({asked}, timeout=limit_s)
         if not done:
+            self.overdue = self.busy
             self._kill()
             await asyncio.wait({asked})  # the end of the process ends the connection
             with suppress(Exception):
@@ -434,7 +482,7 @@ class _Worker:
         self._end()
         ours, theirs = self._context.Pipe()
         started = self._context.Process(
-            target=process.serve, args=(theirs, self._settings, self._abandoned)
+            target=process.serve, args=(theirs, self._settings, self._signals)
         )
         try:
             started.start()

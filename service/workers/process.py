@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import pickle
 import signal
@@ -14,7 +13,7 @@ from multiprocessing.connection import Connection
 from traceback import format_exception
 from typing import TYPE_CHECKING, Any
 
-from service.values import OpenMap, WorkerSettings
+from service.values import OpenMap, Signals, WorkerSettings
 
 if TYPE_CHECKING:
     from service.workers.vision import Vision
@@ -50,11 +49,11 @@ class TracebackInWorker(Exception):
         return f"\n{self.args[0]}"
 
 
-def serve(connection: Connection, settings: WorkerSettings, abandoned: ctypes.c_bool) -> None:
+def serve(connection: Connection, settings: WorkerSettings, signals: Signals) -> None:
     """Do one task after another, until the main process closes its end of the connection.
 
     Args:
-        abandoned: shared with the main process, which sets it when nobody waits for the task.
+        signals: shared with the main process.
     """
     # Both may reach all processes of a group, and the main process decides when to end.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -64,7 +63,7 @@ def serve(connection: Connection, settings: WorkerSettings, abandoned: ctypes.c_
         settings.configure_logging()
     from service.workers.vision import Vision  # not in the main process, which has this module too
 
-    vision = Vision(settings, abandoned)
+    vision = Vision(settings, signals)
     with suppress(EOFError, OSError):  # of the connection
         while True:
             connection.send_bytes(_reply_to(connection.recv_bytes(), vision))

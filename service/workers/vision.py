@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import io
 import logging
 import os
@@ -31,6 +30,7 @@ from service.values import (
     RigJob,
     SequenceJob,
     SequenceStep,
+    Signals,
     WorkerSettings,
 )
 from service.workers.instants import (
@@ -67,16 +67,13 @@ class Vision:
 
     The main process names the tasks by ``service.workers.tasks``; it pickles their arguments and
     what they return.
-
-    Args:
-        abandoned: set when nobody waits for the task any more.
     """
 
-    def __init__(self, settings: WorkerSettings, abandoned: ctypes.c_bool) -> None:
+    def __init__(self, settings: WorkerSettings, signals: Signals) -> None:
         self._settings = settings
         self._limits = ImageLimits(settings.max_image_bytes, settings.max_image_pixels)
-        self._abandoned = abandoned
-        self._maps = OpenMaps(settings)
+        self._signals = signals
+        self._maps = OpenMaps(settings, signals)
 
     @property
     def open_maps(self) -> tuple[OpenMap, ...]:
@@ -96,13 +93,12 @@ class Vision:
         """Use a version once and close it again; errors as in ``OpenMaps.open``."""
         self._maps.try_out(version)
 
-    def warm(self, maps: Sequence[MapFolder]) -> None:
-        """Open maps; log those that cannot be used."""
-        for version in maps:
-            try:
-                self._maps.open(version)
-            except VislocError as error:
-                logger.error("map %s is not loaded: %s", version.ref, error)  # noqa: TRY400
+    def warm(self, version: MapFolder) -> None:
+        """Open a map again that another process had open; log it if it cannot be used."""
+        try:
+            self._maps.open(version)
+        except VislocError as error:
+            logger.error("map %s is not loaded: %s", version.ref, error)  # noqa: TRY400
 
     def forget(self, ref: str) -> None:
         """Close a map that is no longer served."""
@@ -345,7 +341,7 @@ class Vision:
 
     def _step(self) -> None:
         """Stop here when nobody waits any more."""
-        if self._abandoned.value:
+        if self._signals.abandoned:
             raise Abandoned
 
     def _decode(self, query: Query) -> DecodedQuery:

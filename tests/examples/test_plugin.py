@@ -14,9 +14,9 @@ from mapping.sample import write_sample
 
 PLUGIN = Path(__file__).parents[2] / "examples" / "plugin"
 LOCALIZE = """
-import ctypes, sys
+import sys
 from pathlib import Path
-from service.values import MapFolder, WorkerSettings, photo_job
+from service.values import MapFolder, Signals, WorkerSettings, photo_job
 from service.workers.vision import Vision
 from visloc.archive import MapStore
 from visloc.kapture import read_dataset
@@ -31,7 +31,7 @@ job = photo_job(
     (), queries.path_of(record).read_bytes(), queries.sensors[record.sensor_id].camera,
     LocalizeOptions(),
 )
-answer = Vision(settings, ctypes.c_bool()).localize(job, [served], 0.0).answer
+answer = Vision(settings, Signals()).localize(job, [served], 0.0).answer
 print(*answer.pose.rig_from_world.center - queries.pose(record).center)
 print(*answer.images[0].evidence.retrieved[0].similarities)
 """

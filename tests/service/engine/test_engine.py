@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import os
 import shutil
 import signal
@@ -12,6 +13,8 @@ import numpy as np
 import pytest
 
 from service.engine.engine import Engine
+from service.telemetry.logs import RequestRecord, begin_request
+from service.telemetry.metrics import ServiceState
 from service.workers import pool
 from service.workers.tasks import Vision
 from tests.service.engine.engines import (
@@ -123,6 +126,54 @@ def test_a_photo_that_is_worked_on_is_given_up_when_its_caller_leaves(
         await engine.localize(job_for(query))
 
     with_engine(play)
+
+
+def test_the_worker_of_a_caller_who_left_is_replaced_if_it_goes_on_and_its_key_is_named(
+    built_maps: Path,
+    query: Query,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setattr(pool, "_STEP_LIMIT_S", 0.1)
+
+    async def ask(engine: Engine) -> None:
+        begin_request(RequestRecord("http", "the-id", key="robot"))
+        await engine.localize(job_for(query))
+
+    async def play(engine: Engine) -> None:
+        (pid,), loaded = engine.workers.pids, engine.workers.loaded
+        async with held_back(engine):
+            task = asyncio.create_task(ask(engine))
+            await until(lambda: engine.workers.running == 1)
+            other = asyncio.create_task(engine.localize(job_for(query)))
+            task.cancel()
+            assert (await other).answer.pose is not None
+        assert pid not in engine.workers.pids
+        await until(lambda: engine.workers.loaded == loaded)
+        counted = engine._metrics.render(ServiceState())[0].decode()
+        assert 'visloc_workers_ended_total{key="robot"} 1.0' in counted
+        assert "visloc_worker_deaths_total 0.0" in counted
+        assert not [each for each in caplog.records if each.levelno >= logging.ERROR]
+
+    with started(built_maps) as with_engine:
+        with_engine(play)
+
+
+def test_a_new_process_opens_what_the_one_before_had_open_while_no_photo_waits(
+    maps_dir: Path, query: Query
+) -> None:
+    publish(maps_dir, "1", "copy")
+
+    async def play(engine: Engine) -> None:
+        (pid,), loaded = engine.workers.pids, engine.workers.loaded
+        assert len(loaded) == 2
+        os.kill(pid, signal.SIGKILL)
+        await until(lambda: pid not in engine.workers.pids and engine.workers.alive == 1)
+        assert (await engine.localize(job_for(query))).answer.pose is not None
+        await until(lambda: engine.workers.loaded == loaded)
+
+    with started(maps_dir) as with_engine:
+        with_engine(play)
 
 
 def test_workers_work_at_the_same_time(with_two_workers: WithEngine, query: Query) -> None:

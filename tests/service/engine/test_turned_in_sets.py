@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +12,14 @@ import numpy as np
 import pytest
 
 from service.engine.engine import Engine
-from service.values import Localization, MapFolder, RankedTiles, WorkerSettings, photo_job
+from service.values import (
+    Localization,
+    MapFolder,
+    RankedTiles,
+    Signals,
+    WorkerSettings,
+    photo_job,
+)
 from service.workers.vision import Vision
 from tests.service.engine.engines import WithEngine, started
 from tests.service.map_sets import SITE_FROM_ROOM, SITE_FROM_STUDY, photos_of
@@ -111,7 +117,7 @@ def test_where_no_turn_helps_the_photo_is_refused_as_it_was_sent(
 def test_a_turned_photo_ranks_tiles_as_the_upright_one_does(
     upright_site: Path, query: Any, study: Path
 ) -> None:
-    store, process = MapStore(upright_site), Vision(SETTINGS, ctypes.c_bool())
+    store, process = MapStore(upright_site), Vision(SETTINGS, Signals())
     opened = store.open_set("site")
     folder = MapFolder(opened.ref, store.folder("site"), is_set=True)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from service.telemetry.metrics import MAX_MAPS, OTHER_MAPS, Metrics, ServiceState
+from service.telemetry.metrics import MAX_MAPS, NO_KEY, OTHER_MAPS, Metrics, ServiceState
 from visloc.errors import Overloaded
 
 Samples = dict[tuple[str, frozenset[tuple[str, str]]], float]
@@ -90,6 +90,8 @@ def test_changes_of_maps_uploads_and_worker_deaths_are_counted() -> None:
     metrics.observe_uploaded(1000)
     metrics.observe_uploaded(24)
     metrics.observe_worker_death()
+    metrics.observe_worker_ended("robot")
+    metrics.observe_worker_ended(None)
 
     samples, name = scrape(metrics), "visloc_map_changes_total"
     assert value(samples, name, change="upload", result="done") == 1
@@ -97,6 +99,8 @@ def test_changes_of_maps_uploads_and_worker_deaths_are_counted() -> None:
     assert value(samples, name, change="activate", result="done") == 0
     assert value(samples, "visloc_uploaded_bytes_total") == 1024
     assert value(samples, "visloc_worker_deaths_total") == 1
+    assert value(samples, "visloc_workers_ended_total", key="robot") == 1
+    assert value(samples, "visloc_workers_ended_total", key=NO_KEY) == 1
 
 
 def test_the_number_of_series_is_bounded_however_many_maps_come_and_go() -> None:

@@ -2,13 +2,21 @@ from __future__ import annotations
 
 import asyncio
 import os
+import re
 import signal
+import time
+from collections.abc import Callable
+from operator import methodcaller
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
-from service.values import WorkerSettings
+from service.values import Abandoned, MapFolder, WorkerSettings
 from service.workers import pool
 from service.workers.pool import Turn, _Worker, share_of_cores
+from service.workers.vision import Vision
 from visloc.errors import Unavailable
 
 
@@ -72,25 +80,26 @@ def test_silence_between_the_instants_of_a_stream_earns_no_right_to_overtake(clo
         assert each.rank() > photo
 
 
+SETTINGS = WorkerSettings(
+    weights_dir=None,
+    threads=1,
+    max_loaded_bytes=2**30,
+    max_images=16,
+    max_instants=1000,
+    max_image_bytes=2**20,
+    max_image_pixels=10**6,
+)
+
+
 def much(_: object) -> bytes:
     """A task whose result takes a while to send."""
     return bytes(2**28)
 
 
 def test_a_worker_that_is_killed_in_the_middle_of_its_answer_is_known_to_be_dead() -> None:
-    settings = WorkerSettings(
-        weights_dir=None,
-        threads=1,
-        max_loaded_bytes=2**30,
-        max_images=16,
-        max_instants=1000,
-        max_image_bytes=2**20,
-        max_image_pixels=10**6,
-    )
-
     async def play() -> None:
-        worker = _Worker(settings)
-        await worker.start(())
+        worker = _Worker(SETTINGS)
+        await worker.start()
         asked = asyncio.create_task(worker.run(300.0, much, 1))
         assert worker._connection is not None
         while not worker._connection.poll(0):  # it begins to answer
@@ -100,6 +109,80 @@ def test_a_worker_that_is_killed_in_the_middle_of_its_answer_is_known_to_be_dead
             with pytest.raises(Unavailable) as caught:
                 await asked
         assert caught.value.code == "server.worker_died"
+        await worker.stop()
+
+    asyncio.run(play())
+
+
+LONG_S = 60.0
+
+
+def waits(_: Vision) -> None:
+    """A task within native code that lets other threads run."""
+    time.sleep(LONG_S)
+
+
+def computes(_: Vision) -> None:
+    """A task within native code that lets no other thread run."""
+    re.fullmatch("(a+)+", "a" * 40 + "b")
+
+
+def stopped(_: Vision) -> None:
+    """A task that takes no signals, as if the system had no time for it."""
+    os.kill(os.getpid(), signal.SIGSTOP)
+
+
+def opens(vision: Vision) -> None:
+    """A task that opens a map, which takes longer than a task may go on."""
+
+    def slow(_: object) -> Any:
+        time.sleep(0.5)
+        return SimpleNamespace(map=SimpleNamespace(size_bytes=1))
+
+    vision._maps._open = slow  # type: ignore[method-assign]
+    vision.load(MapFolder("hall@1", Path("hall")))
+    time.sleep(LONG_S)
+
+
+def steps(vision: Vision) -> None:
+    """A task that ends at its next step."""
+    while True:
+        vision._step()
+        time.sleep(0.01)
+
+
+@pytest.mark.parametrize(
+    ("task", "limit_s", "is_ended"),
+    [
+        (waits, 0.1, True),
+        (computes, 0.1, True),
+        (stopped, 0.1, True),
+        (opens, 0.1, False),  # else a map that takes long would never be open
+        (steps, LONG_S, False),
+    ],
+)
+def test_a_process_is_ended_if_it_goes_on_with_a_task_that_nobody_waits_for(
+    monkeypatch: pytest.MonkeyPatch, task: Callable[[Vision], None], limit_s: float, is_ended: bool
+) -> None:
+    monkeypatch.setattr(pool, "_STEP_LIMIT_S", limit_s)
+
+    async def play() -> None:
+        worker = _Worker(SETTINGS)
+        await worker.start()
+        pid = worker.pid
+        asked = asyncio.create_task(worker.run(300.0, task, 1))
+        async with asyncio.timeout(20):
+            while not worker.busy or worker._signals.opening != (task is opens):
+                await asyncio.sleep(0)
+            worker.abandon()
+            await asyncio.wait({asked})
+        assert (worker.overdue, worker.alive) == (is_ended, not is_ended)
+        assert isinstance(asked.exception(), Unavailable if is_ended else Abandoned)
+        if is_ended:
+            await worker.start()
+        assert (await worker.run(300.0, methodcaller("ping"), 1) == pid) != is_ended
+        assert not worker.overdue
+        assert [opened.ref for opened in worker.open_maps] == ["hall@1"] * (task is opens)
         await worker.stop()
 
     asyncio.run(play())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 from dataclasses import replace
 from pathlib import Path
 from time import time
@@ -10,7 +9,7 @@ from typing import Protocol
 
 import pytest
 
-from service.values import Abandoned, MapFolder, WorkerSettings, photo_job
+from service.values import Abandoned, MapFolder, Signals, WorkerSettings, photo_job
 from service.workers.vision import Vision
 from tests.turning import png, turned_camera, turned_pixels, turned_pose
 from visloc.archive import MapStore
@@ -36,7 +35,7 @@ def test_a_photo_of_a_turned_camera_is_found_and_drawn(
     maps = [MapFolder(store.open("room").ref, store.folder("room"))]
     image = png(turned_pixels(read_photo(query.image).rgb, 3))
     camera, truth = turned_camera(query.camera, 3), turned_pose(query.cam_from_world, 3)
-    process = Vision(SETTINGS, ctypes.c_bool())
+    process = Vision(SETTINGS, Signals())
 
     job = photo_job(("room",), image, camera, LocalizeOptions())
     found = process.localize(replace(job, debug=True), maps, time())
@@ -61,12 +60,12 @@ def test_a_photo_of_a_turned_camera_is_found_and_drawn(
     elsewhere = process.localize(mirrored, maps, time())
     assert elsewhere.answer.refusal is not None
     assert elsewhere.answer.seconds["turns"] > 0
-    abandoned = ctypes.c_bool()
-    leaving = Vision(SETTINGS, abandoned)
+    signals = Signals()
+    leaving = Vision(SETTINGS, signals)
     leaving.load(maps[0])
 
     def leave(*_: object) -> int:
-        abandoned.value = True
+        signals.abandoned = True
         return 0
 
     monkeypatch.setattr(TurnFinder, "_clear_matches", leave)

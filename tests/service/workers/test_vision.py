@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import ctypes
 import json
 import os
 import pickle
@@ -19,6 +18,7 @@ from service.values import (
     MapFolder,
     RigJob,
     SequenceJob,
+    Signals,
     WorkerSettings,
     photo_job,
 )
@@ -50,7 +50,7 @@ def test_global_descriptors_are_made_once_for_all_maps_with_the_settings(
         return make_global_descriptor(str(arguments[0]))
 
     monkeypatch.setattr(opening, "make_global_descriptor", make)
-    maps = OpenMaps(SETTINGS)
+    maps = OpenMaps(SETTINGS, Signals())
     folder = MapStore(built_maps).folder("room")
     for ref in ("room@1", "room@2"):
         maps.localizer(MapFolder(ref, folder))
@@ -59,7 +59,7 @@ def test_global_descriptors_are_made_once_for_all_maps_with_the_settings(
 
 
 def test_a_task_computes_with_the_threads_that_it_was_given() -> None:
-    one = Vision(SETTINGS, ctypes.c_bool(False))
+    one = Vision(SETTINGS, Signals())
     with threads(2):
         reply = pickle.loads(_reply_to(pickle.dumps((methodcaller("ping"), 1)), one))
         assert reply.result == os.getpid()
@@ -76,13 +76,15 @@ def test_a_map_whose_descriptor_has_no_weights_here_is_a_conflict(
 
     monkeypatch.setattr(opening, "make_global_descriptor", make)
     with pytest.raises(Conflict) as caught:
-        OpenMaps(SETTINGS).localizer(MapFolder("room@1", MapStore(built_maps).folder("room")))
+        OpenMaps(SETTINGS, Signals()).localizer(
+            MapFolder("room@1", MapStore(built_maps).folder("room"))
+        )
     assert caught.value.code == "weights.missing"
 
 
 def test_a_version_that_another_replica_removed_is_no_damaged_map(tmp_path: Path) -> None:
     with pytest.raises(NotFound, match="the version was removed") as caught:
-        OpenMaps(SETTINGS).open(MapFolder("room@1", tmp_path / "room" / "1"))
+        OpenMaps(SETTINGS, Signals()).open(MapFolder("room@1", tmp_path / "room" / "1"))
     assert caught.value.code == "map.version"
 
 
@@ -90,11 +92,11 @@ def test_work_that_was_given_up_ends_when_its_photo_is_decoded(
     open_maps: tuple[Vision, list[MapFolder]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _, maps = open_maps
-    given_up = ctypes.c_bool()
+    given_up = Signals()
     process = Vision(SETTINGS, given_up)
 
     def decode(*_: object) -> DecodedQuery:
-        given_up.value = True
+        given_up.abandoned = True
         return DecodedQuery(QueryFeatures("sift", *[np.empty((0, 2))] * 2, {}), {}, {})
 
     monkeypatch.setattr(vision, "decode", decode)
@@ -121,7 +123,7 @@ def open_maps(
     manifest.write_text(json.dumps(record))
     folders = [MapStore(maps).folder(name) for name in ("room", "hall")]
     refs = [MapStore(maps).open(name).ref for name in ("room", "hall")]
-    return Vision(SETTINGS, ctypes.c_bool()), [
+    return Vision(SETTINGS, Signals()), [
         MapFolder(ref, folder) for ref, folder in zip(refs, folders, strict=True)
     ]
 
