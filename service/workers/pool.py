@@ -51,8 +51,8 @@ _RESTART_PAUSE_S = 1.0
 # Longest time for a process to begin, and for it to open a map that is in service.
 _START_LIMIT_S = 300.0
 # How long a process may go on with a task that nobody waits for any more, until its next step. A
-# new process takes about as long to begin (docs/decisions/0057-abandoned-workers.md).
-_STEP_LIMIT_S = 1.0
+# new process takes about as long to begin and open a map (decision 0057).
+_STEP_LIMIT_S = 0.5
 _PING = methodcaller(str(Vision.ping))
 # The seconds by which a request falls back in the queue for each second that workers spent on it.
 # Twice as many as there are sequences at once by default: all together then take at most half of a
@@ -342,7 +342,8 @@ class Workers:
         if not one.overdue:
             logger.error("worker process %s died; starting another", one.pid)
             self._on_death()
-        one.unopened.extendleft(opened.ref for opened in reversed(one.open_maps))
+        before = (opened.ref for opened in one.open_maps)
+        one.unopened = deque(dict.fromkeys((*before, *one.unopened)))
         while True:
             try:
                 await one.start()

@@ -44,6 +44,7 @@ def known_series() -> dict[str, set[str]]:
     metrics.observe_error("http", VislocError("server.internal", "a mistake"))
     metrics.observe_localization("hall", None, 50, {"pose": 0.1})
     metrics.observe_map_change("upload", done=True)
+    metrics.observe_worker_ended("robot")
     state = ServiceState(
         ready=True,
         worker_pids=(os.getpid(),),
