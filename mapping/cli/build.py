@@ -25,7 +25,8 @@ from mapping.cli.display import (
 from mapping.cli.progress import StageProgress
 from mapping.cluster.stage_timings import Costs
 from mapping.cluster.storage import is_map_folder, open_store, scratch_folder
-from mapping.importers import IMPORTERS, ImportSummary, import_dataset, imported
+from mapping.importers import IMPORTERS, MASKS, ImportSummary, import_dataset, imported
+from mapping.methods.rgbd import DepthSettings
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.options import (
     SFM_PANEL,
@@ -132,6 +133,10 @@ def _import_dataset(settings: ImportSettings, output: Path) -> None:
     else:  # a dataset cannot say so itself
         metric = summary.metric if settings.metric is None else settings.metric
         options.append("--metric" if metric else "--not-metric")
+    if method == "rgbd" and summary.depth_scale != DepthSettings().depth_scale:
+        options += ["--depth-scale", f"{summary.depth_scale!r}"]
+    if summary.masks:
+        options += ["--masks", str(output / MASKS)]
     say(f"dataset: {output}")
     say(f"next: mapping build {output} --map ID {' '.join(options)}")
 
@@ -163,6 +168,8 @@ def _import_map(settings: ImportSettings, map_id: str) -> None:
                 max_keypoints=settings.max_keypoints,
                 metric=summary.metric if settings.metric is None else settings.metric,
                 sfm=sfm,
+                depth=DepthSettings(depth_scale=summary.depth_scale),
+                masks=dataset / MASKS if summary.masks else None,
                 workers=settings.workers,
                 force=settings.force,
                 accept=settings.accept,

@@ -13,7 +13,7 @@ from functools import partial
 from importlib import import_module
 from pathlib import Path
 
-from mapping.importers.dataset import write_imported
+from mapping.importers.dataset import MASKS, write_imported
 from mapping.importers.model import ImportedImage, ImportedModel
 from mapping.progress import Progress, one_step
 from mapping.stages.outputs import refuse_existing
@@ -23,6 +23,7 @@ from visloc.errors import refuse
 
 __all__ = [
     "IMPORTERS",
+    "MASKS",
     "ImportSummary",
     "ImportedImage",
     "ImportedModel",
@@ -58,6 +59,8 @@ class ImportSummary:
         posed: photos with a pose.
         cameras: cameras, those of unknown intrinsics included.
         depth_maps: depth maps.
+        depth_scale: units of the world in one unit of the depth maps.
+        masks: masks of photos, in the folder ``MASKS`` of the dataset.
         gnss: GNSS fixes.
         points: 3D points.
         observations: keypoints that see a point.
@@ -71,6 +74,8 @@ class ImportSummary:
     posed: int
     cameras: int
     depth_maps: int
+    depth_scale: float
+    masks: int
     gnss: int
     points: int
     observations: int
@@ -166,6 +171,8 @@ def import_dataset(
         posed=sum(image.cam_from_world is not None for image in model.images),
         cameras=kinds.count("camera"),
         depth_maps=sum(image.depth is not None for image in model.images),
+        depth_scale=model.depth_scale,
+        masks=sum(image.mask is not None for image in model.images),
         gnss=len(model.gnss),
         points=len(model.points),
         observations=len(model.observations),

@@ -24,6 +24,7 @@ from visloc.kapture import (
 )
 from visloc.kapture.text import is_field, is_folder_name, relative_path
 
+MASKS = "masks"  # the folder of a dataset for ``mapping build --masks``
 _NAMED = 3  # how many names an error or note lists
 
 
@@ -38,9 +39,10 @@ def depth_sensor_id(sensor: str) -> str:
 def write_imported(model: ImportedModel, output: Path) -> tuple[str, ...]:
     """Write a kapture 1.1 dataset: sensors, poses, records, keypoints, descriptors and points.
 
-    Photos are not copied: ``sensors/records_data`` is a symbolic link to their folder. A photo
-    without its file stays in the dataset, with a note. Files that are not used are listed beside
-    the dataset, see ``left_out.list_path``.
+    Photos are not copied: ``sensors/records_data`` is a symbolic link to their folder, and
+    ``masks`` holds links to their masks, under the names that a build looks for. A photo without
+    its file stays in the dataset, with a note. Files that are not used are listed beside the
+    dataset, see ``left_out.list_path``.
 
     Args:
         model: the model. The depth map of a photo is of the sensor ``depth_sensor_id`` of the
@@ -68,6 +70,7 @@ def write_imported(model: ImportedModel, output: Path) -> tuple[str, ...]:
         sensors.mkdir(parents=True)
         if model.photos is not None:
             (sensors / "records_data").symlink_to(model.photos.resolve())
+            _link_masks(model.images, model.photos.resolve(), root / MASKS)
         write_dataset(_dataset(model, root))
         _write_features(model, root)
         if len(model.points):
@@ -96,6 +99,17 @@ def _dataset(model: ImportedModel, root: Path) -> Dataset:
         depth_maps=_sorted(depth_maps),
         gnss=tuple(sorted(model.gnss, key=lambda record: (record.timestamp, record.sensor_id))),
     )
+
+
+def _link_masks(images: Iterable[ImportedImage], photos: Path, folder: Path) -> None:
+    for image in images:
+        if image.mask is not None:
+            link = folder / f"{image.name}.png"
+            try:
+                link.parent.mkdir(parents=True, exist_ok=True)
+                link.symlink_to(photos / image.mask)
+            except OSError as error:  # a name that is too long with the suffix
+                raise refuse("import.name", field=f"mask of {image.name!r}", got=link) from error
 
 
 def _sorted(records: Iterable[FileRecord]) -> tuple[FileRecord, ...]:

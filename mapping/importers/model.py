@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.importers.left_out import LeftOut
+from mapping.stages.depth import DEFAULT_DEPTH_SCALE
 from visloc.geometry import Pose
 from visloc.kapture import GnssRecord, Sensor
 
@@ -28,6 +29,7 @@ class ImportedImage:
             when the format has none.
         descriptors: (n, D), row by row those of the keypoints; None without.
         depth: its depth map, relative to the folder of photos; None without.
+        mask: its mask, black where the photo does not count, relative to the same; None without.
     """
 
     name: str
@@ -37,6 +39,7 @@ class ImportedImage:
     keypoints: NDArray[np.float32] | None = None
     descriptors: NDArray[Any] | None = None
     depth: str | None = None
+    mask: str | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,6 +57,7 @@ class ImportedModel:
         keypoints_type: folder name for the keypoints, such as ``sift``.
         gnss: fixes.
         metric: whether a unit of the world is known to be a metre.
+        depth_scale: units of the world in one unit of the depth maps.
         notes: what was left out or assumed, one sentence each.
         left_out: names of files in the folder of photos that are not used, by reason.
     """
@@ -67,5 +71,6 @@ class ImportedModel:
     keypoints_type: str = "imported"
     gnss: tuple[GnssRecord, ...] = ()
     metric: bool = False
+    depth_scale: float = DEFAULT_DEPTH_SCALE
     notes: tuple[str, ...] = ()
     left_out: LeftOut = field(default_factory=dict)

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from mapping.importers.dataset import depth_sensor_id
 from mapping.importers.model import ImportedImage, ImportedModel
-from mapping.importers.reading.json_fields import JsonValue, read_json
+from mapping.importers.reading.json_fields import JsonValue, notes_on_unread, read_json
 from mapping.importers.reading.photo_names import photo_names, photo_size
 from mapping.importers.reading.tracks import rotation_from_matrix
-from mapping.stages.depth import DEFAULT_DEPTH_SCALE
+from mapping.stages.depth import DEFAULT_DEPTH_SCALE, is_png_of_16_bits
 from visloc.errors import DatasetError, InvalidInput, VislocError, refuse
 from visloc.geometry import MAX_IMAGE_SIDE, Camera, Pose
 from visloc.kapture import Sensor
@@ -30,6 +30,9 @@ _SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
 _OURS_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+_UNITS = ("depth_unit_scale_factor", "integer_depth_scale")  # nerfstudio's key, instant-ngp's
+_DEGREE = math.pi / 180
+_SAME_FOCAL = 0.01  # relative; angles and sizes are written with few digits
 _NAMED = 3
 
 
@@ -40,6 +43,9 @@ class _Seen:
     sensors: dict[str, Sensor] = field(default_factory=dict)
     cameras: dict[tuple[Camera, tuple[int, int] | None], str] = field(default_factory=dict)
     left_out: dict[str, list[str]] = field(default_factory=dict)
+
+    def leave_out(self, why: str, name: str) -> None:
+        self.left_out.setdefault(why, []).append(name)
 
     def sensor_of(self, camera: Camera, depth_size: tuple[int, int] | None) -> str:
         """Return the id of the sensor of a photo, made if it is new, with its depth sensor."""
@@ -57,9 +63,9 @@ class _Seen:
 def read(path: Path, photos: Path | None = None) -> ImportedModel:
     """Read a ``transforms.json``.
 
-    Depth maps that are 16-bit PNGs go with their photos; they are registered to them, maybe of
-    another size. The world is metric if there are such depth maps, which are in metres by
-    definition, and the file does not say that positions were scaled.
+    Masks, and depth maps that are 16-bit PNGs, go with their photos; depth is registered to them,
+    maybe of another size. The world is metric if there are depth maps of nerfstudio's key, which
+    are in metres by definition, and the file does not say that positions were scaled.
 
     Args:
         path: the file, or the folder that holds it.
@@ -82,13 +88,15 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
         for rank, (frame, name) in enumerate(zip(frames, names, strict=True))
     )
     with_depth = any(image.depth is not None for image in images)
-    notes, is_scaled = _notes(top, with_depth)
+    depth_scale = _depth_scale(top)
+    notes, is_scaled = _notes(top)
     notes += name_notes
     notes += [
         f"{len(names)} {why}: {', '.join(names[:_NAMED])}" + (", ..." if names[_NAMED:] else "")
         for why, names in seen.left_out.items()
     ]
-    metric = with_depth and not is_scaled
+    in_metres = any(frame.get_set("depth_file_path") is not None for frame in frames)
+    metric = with_depth and in_metres and not is_scaled
     if not metric:
         notes.append(
             "nothing says that a unit of the world is a metre: it is if a recorder with ARKit, "
@@ -102,7 +110,8 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
         colors=np.empty((0, 3), np.uint8),
         observations=np.empty((0, 3), np.int64),
         metric=metric,
-        notes=tuple(notes),
+        depth_scale=depth_scale,
+        notes=(*notes, *notes_on_unread(top)),
     )
 
 
@@ -115,14 +124,20 @@ def _image(
     folder: Path,
     seen: _Seen,
 ) -> ImportedImage:
-    camera = _camera(top, frame, folder / name)
-    depth, depth_size = _depth(frame, base, folder, seen)
+    camera = _camera(top, frame, name, folder, seen)
+    value = frame.get_set("depth_file_path") or frame.get_set("depth_path")  # instant-ngp's
+    depth = _file_beside(value, "depth maps", base, folder, seen)
+    if depth is not None and not is_png_of_16_bits(folder / depth):
+        seen.leave_out("depth maps are not 16-bit grey PNGs and left out", depth)
+        depth = None
+    depth_size = None if depth is None else photo_size(folder / depth)
     return ImportedImage(
         name=name,
         sensor=seen.sensor_of(camera, depth_size),
         timestamp=rank,
         cam_from_world=_pose(frame["transform_matrix"]),
         depth=depth,
+        mask=_file_beside(frame.get_set("mask_path"), "masks", base, folder, seen),
     )
 
 
@@ -175,47 +190,62 @@ def _no_rotation(matrix: NDArray[np.float64], value: JsonValue) -> VislocError:
     )
 
 
-def _camera(top: JsonValue, frame: JsonValue, photo: Path) -> Camera:
+def _camera(top: JsonValue, frame: JsonValue, name: str, folder: Path, seen: _Seen) -> Camera:
     def find(key: str) -> JsonValue | None:
-        return frame.get(key) or top.get(key)
+        own, shared = frame.get_set(key), top.get_set(key)  # asked for both, so that both are read
+        return own or shared
 
     def number(key: str) -> float | None:
         value = find(key)
         return None if value is None else value.number()
 
-    size = _size(find("w"), find("h")) or photo_size(photo)
+    def focal_length(axis: str, side: int) -> float | None:
+        """Return what the file gives for an axis: pixels, or an angle over a side of the photo."""
+        given = number(f"fl_{axis}")
+        angles = ((f"camera_angle_{axis}", "radians", 1.0), (f"{axis}_fov", "degrees", _DEGREE))
+        for key, unit, radians in angles:
+            angle = find(key)
+            if angle is None:
+                continue
+            if not 0 < angle.number() * radians < math.pi:
+                raise angle.error("the angle is not valid", expected=f"above 0 {unit}, below pi")
+            other = 0.5 * side / math.tan(0.5 * angle.number() * radians)
+            given = other if given is None else given
+            if abs(other - given) > _SAME_FOCAL * given:
+                seen.leave_out(f"{key} contradict the focal length that was taken", name)
+        return given
+
+    size = _size(find("w"), find("h")) or photo_size(folder / name)
     if size is None:
         raise frame.error("neither the file nor a photo gives the image size", expected="w and h")
     width, height = size
-    focal = number("fl_x")
-    angle = number("camera_angle_x")
-    if focal is None and angle is not None and 0 < angle < math.pi:
-        focal = 0.5 * width / math.tan(0.5 * angle)
-    if focal is None:
-        raise frame.error("the focal length is missing", expected="fl_x or camera_angle_x")
-    fy, cx, cy = number("fl_y"), number("cx"), number("cy")
+    fx, fy = focal_length("x", width), focal_length("y", height)
+    if fx is None:
+        expected = "fl_x, camera_angle_x or x_fov"
+        raise frame.error("the focal length is missing", expected=expected)
+    cx, cy = number("cx"), number("cy")
     pinhole = (
-        focal,
-        focal if fy is None else fy,
+        fx,
+        fx if fy is None else fy,
         width / 2 if cx is None else cx,
         height / 2 if cy is None else cy,
     )
     model = find("camera_model")
     is_fisheye = find("is_fisheye")
-    name = "OPENCV" if model is None else model.text()
-    if is_fisheye is not None and is_fisheye.value is True:
-        name = "OPENCV_FISHEYE"
+    kind = "OPENCV" if model is None else model.text()
+    if is_fisheye is not None and is_fisheye.flag():
+        kind = "OPENCV_FISHEYE"
     k1, k2, k3, k4, p1, p2 = (number(key) or 0.0 for key in _DISTORTION)
     params: tuple[float, ...]
-    if name == "OPENCV_FISHEYE":
-        ours, params = name, (*pinhole, k1, k2, k3, k4)
-    elif name not in _PERSPECTIVE:
+    if kind == "OPENCV_FISHEYE":
+        ours, params = kind, (*pinhole, k1, k2, k3, k4)
+    elif kind not in _PERSPECTIVE:
         raise refuse(
             "camera.model",
             "kapture does not have this camera model",
             field=(model or frame).where,
             expected=(*_PERSPECTIVE, "OPENCV_FISHEYE"),
-            got=name,
+            got=kind,
             kind=DatasetError,
         )
     elif k4:
@@ -246,37 +276,36 @@ def _size(width: JsonValue | None, height: JsonValue | None) -> tuple[int, int] 
     return sides[0], sides[1]
 
 
-def _depth(
-    frame: JsonValue, base: Path, folder: Path, seen: _Seen
-) -> tuple[str | None, tuple[int, int] | None]:
-    """Return the depth map of a frame and its size; None for both without a usable one."""
-    value = frame.get("depth_file_path")
-    if value is None or value.value is None:
-        return None, None
+def _file_beside(
+    value: JsonValue | None, what: str, base: Path, folder: Path, seen: _Seen
+) -> str | None:
+    """Return the name of a photo's depth map or mask; None without such a file."""
+    if value is None:
+        return None
     (name,), shortened = photo_names([(value.text(), value.where)], base, folder)
     if shortened:
-        seen.left_out.setdefault(
-            "names of depth maps lead out of the folder; their last part was taken", []
-        ).append(value.text())
-    if PurePosixPath(name).suffix.lower() != ".png":
-        seen.left_out.setdefault("depth maps are not PNGs and left out", []).append(name)
-        return None, None
-    size = photo_size(folder / name)
-    if size is None:
-        seen.left_out.setdefault("depth maps are missing", []).append(name)
-        return None, None
-    return name, size
+        why = f"names of {what} lead out of the folder; their last part was taken"
+        seen.leave_out(why, value.text())
+    if not _exists(folder / name):
+        seen.leave_out(f"{what} are missing", name)
+        return None
+    return name
 
 
-def _notes(top: JsonValue, with_depth: bool) -> tuple[list[str], bool]:
+def _depth_scale(top: JsonValue) -> float:
+    """Return how many metres, or units of the world, one unit of the depth maps is."""
+    given = [value for key in _UNITS if (value := top.get_set(key)) is not None]
+    for value in given:
+        if not value.number() > 0:
+            raise value.error("the unit of depth maps is not valid", expected="more than 0")
+        if value.number() != given[0].number():
+            raise value.error(f"the value contradicts {given[0].key}", expected="one unit")
+    return given[0].number() if given else DEFAULT_DEPTH_SCALE
+
+
+def _notes(top: JsonValue) -> tuple[list[str], bool]:
     """Return what the top says that is not kept, and whether positions were scaled."""
     notes = []
-    scale = top.get("depth_unit_scale_factor")
-    if with_depth and scale is not None and scale.number() != DEFAULT_DEPTH_SCALE:
-        notes.append(
-            f"the unit of depth maps is {scale.number():g} m: build with "
-            f"--depth-scale {scale.number():g}"
-        )
     if top.get("applied_transform") is not None:
         notes.append(
             "applied_transform is left out: positions are as in the file, after that transform"

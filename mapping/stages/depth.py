@@ -30,7 +30,7 @@ _NO_DEPTH = 65535  # the code of 16-bit recorders for "none"
 _NO_DEPTH_M, _ROUNDED_BY_M = 65.535, 0.0005
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_HEADER_BYTES = 33
-_PNG_GREY = 0
+_DEPTH_KIND = (16, 0)  # bits for each channel, and PNG's type of grey
 
 # Poses are written with few digits; this much moves a pixel by less than a tenth.
 _SAME_ROTATION_RAD = 1e-4
@@ -226,11 +226,19 @@ def _read_raw(path: Path, camera: Camera) -> NDArray[np.float32]:
     return values.reshape(camera.height, camera.width)
 
 
+def is_png_of_16_bits(path: Path) -> bool:
+    """Tell whether the header of a file is that of a depth map: a PNG of 16 bits and no colours."""
+    with path.open("rb") as file:
+        header = file.read(_PNG_HEADER_BYTES)
+    is_png = header.startswith(_PNG_SIGNATURE) and len(header) == _PNG_HEADER_BYTES
+    return is_png and (header[24], header[25]) == _DEPTH_KIND
+
+
 def _check_png_header(path: Path, header: bytes, camera: Camera) -> None:
     if len(header) < _PNG_HEADER_BYTES or header[12:16] != b"IHDR":
         raise _damaged(path, "no header")
     width, height, bit_depth, color_type = struct.unpack_from(">IIBB", header, 16)
-    if (bit_depth, color_type) != (16, _PNG_GREY):
+    if (bit_depth, color_type) != _DEPTH_KIND:
         raise refuse(
             "depth.format",
             field=str(path),

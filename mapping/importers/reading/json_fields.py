@@ -1,17 +1,24 @@
-"""Values of a JSON file that know where they stand, so that every error can say it."""
+"""Values of a JSON file that know where they stand, and which of them were asked for."""
 
 from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn
 
 from visloc.errors import VislocError, refuse
 
 LARGEST = 1e15  # of any number: what poses and points are made of must not overflow
+_NAMED = 10  # how many fields a note lists
+
+# By key, those asked for of each object that stood at one place; None for all keys of an object
+# or all elements of an array. Places are told apart by keys, not by indices: one entry serves the
+# frames of a whole recording.
+_Asked = dict[str | None, "_Asked"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,12 +30,14 @@ class JsonValue:
         file: the file.
         parent: the object or array that holds it; None at the top.
         key: its key or index there.
+        asked: the fields below it that were asked for, in any object of this place.
     """
 
     value: Any
     file: Path
     parent: JsonValue | None = None
     key: str | int = ""
+    asked: _Asked = field(default_factory=dict, repr=False)
 
     @property
     def where(self) -> str:
@@ -62,19 +71,30 @@ class JsonValue:
         """Return a field of this object, None without it."""
         if not isinstance(self.value, dict):
             raise self.error("the value is not an object", expected="an object")
-        return JsonValue(self.value[key], self.file, self, key) if key in self.value else None
+        asked = self.asked.setdefault(key, {})
+        return JsonValue(self.value[key], self.file, self, key, asked) if key in self.value else None
+
+    def get_set(self, key: str) -> JsonValue | None:
+        """Return a field of this object, None without it or where it is null."""
+        found = self.get(key)
+        return None if found is None or found.value is None else found
 
     def fields(self) -> Iterator[tuple[str, JsonValue]]:
         """Go through the fields of this object, in the file's order."""
         if not isinstance(self.value, dict):
             raise self.error("the value is not an object", expected="an object")
-        return ((key, JsonValue(value, self.file, self, key)) for key, value in self.value.items())
+        asked = self.asked.setdefault(None, {})
+        return (
+            (key, JsonValue(value, self.file, self, key, asked))
+            for key, value in self.value.items()
+        )
 
     def elements(self) -> list[JsonValue]:
         """Return the elements of this array."""
         if not isinstance(self.value, list):
             raise self.error("the value is not an array", expected="an array")
-        return [JsonValue(value, self.file, self, i) for i, value in enumerate(self.value)]
+        asked = self.asked.setdefault(None, {})
+        return [JsonValue(value, self.file, self, i, asked) for i, value in enumerate(self.value)]
 
     def number(self) -> float:
         """Return this finite number."""
@@ -100,11 +120,42 @@ class JsonValue:
             raise self.error("the number is not valid", expected=f"a whole number, 0 to {high}")
         return self.value
 
+    def flag(self) -> bool:
+        """Return this true or false."""
+        if not isinstance(self.value, bool):
+            raise self.error("the value is neither true nor false", expected="true or false")
+        return self.value
+
     def text(self) -> str:
         """Return this text."""
         if not isinstance(self.value, str):
             raise self.error("the value is not a text", expected="a text")
         return self.value
+
+
+def notes_on_unread(top: JsonValue) -> tuple[str, ...]:
+    """Count the fields in a value that nothing has asked for, those that are null aside."""
+    unread: Counter[str] = Counter()
+    stack: list[tuple[Any, _Asked, str]] = [(top.value, top.asked, "")]
+    while stack:
+        value, asked, place = stack.pop()
+        within = asked.get(None)
+        if isinstance(value, list) and within is not None:
+            stack += [(element, within, f"{place}[]") for element in value]
+        elif isinstance(value, dict) and asked:  # else it was taken, or passed over, as a whole
+            for key, inner in value.items():
+                below = asked.get(key, within)
+                shown = key if key.isprintable() and len(key) <= 40 else ascii(key[:40])
+                path = f"{place}.{'*' if key not in asked and within is not None else shown}"
+                if below is not None:
+                    stack.append((inner, below, path))
+                elif inner is not None:
+                    unread[path.removeprefix(".")] += 1
+    if not unread:
+        return ()
+    some = ", ".join(f"{path} ({count})" for path, count in unread.most_common(_NAMED))
+    more = f" and {len(unread) - _NAMED} more kinds" if len(unread) > _NAMED else ""
+    return (f"{top.file.name} has fields that are not read: {some}{more}",)
 
 
 def read_json(path: Path) -> JsonValue:

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mapping.importers import import_dataset
+from mapping.importers import MASKS, import_dataset
 from mapping.importers.nerfstudio import read
 from mapping.stages.depth import DepthMatcher, photo_depth, read_depth
+from mapping.stages.photos import collect_photos, masked
 from visloc.errors import DatasetError, VislocError
 from visloc.geometry import Camera
 from visloc.kapture import read_dataset
@@ -182,22 +183,91 @@ def test_what_is_not_kept_is_noted(recorded: Path, tmp_path: Path) -> None:
         "applied_scale": 0.5,
         "ply_file_path": "points.ply",
     }
-    top["frames"][1]["depth_file_path"] = "depth/1.npy"
+    top["frames"][1]["depth_file_path"] = top["frames"][1]["file_path"]
     top["frames"][2]["depth_file_path"] = "depth/gone.png"
+    top["frames"][3] |= {"sharpness": 7.0, "colmap_im_id": 3, "time": None}
+    top["frames"][4] |= {"sharpness": 7.0}
     model = read(write(tmp_path, top), recorded)
     assert not model.metric
+    assert model.depth_scale == 0.0002
     text = "\n".join(model.notes)
     for part in (
-        "--depth-scale 0.0002",
         "applied_transform",
         "applied_scale is 0.5",
         "ply_file_path",
-        "1 depth maps are not PNGs and left out: depth/1.npy",
+        "1 depth maps are not 16-bit grey PNGs and left out: images/1",
+        "has fields that are not read: frames[].sharpness (2), frames[].colmap_im_id (1)",
         "1 depth maps are missing: depth/gone.png",
         "nothing says that a unit of the world is a metre",
     ):
         assert part in text
     assert sum(image.depth is not None for image in model.images) == 6
+
+
+@pytest.mark.parametrize(
+    ("changes", "fx", "fy", "note"),
+    [
+        ({"camera_angle_x": 2 * math.atan(32 / 40)}, 40, 40, ""),
+        (
+            {"camera_angle_x": 2 * math.atan(32 / 40), "camera_angle_y": 2 * math.atan(24 / 44)},
+            *(40, 44, ""),
+        ),
+        ({"x_fov": math.degrees(2 * math.atan(32 / 40)), "y_fov": 90}, 40, 24, ""),
+        ({"fl_x": 50, "y_fov": 90}, 50, 24, ""),
+        ({"fl_x": 50, "camera_angle_x": 2 * math.atan(32 / 50.2)}, 50, 50, ""),
+        ({"fl_x": 50, "camera_angle_x": 1.0}, 50, 50, "1 camera_angle_x contradict the focal"),
+        ({"fl_x": 50, "fl_y": 60, "y_fov": 80}, 50, 60, "1 y_fov contradict the focal length"),
+        ({"fl_x": 50, "fl_y": None, "cx": None}, 50, 50, ""),
+    ],
+)
+def test_focal_lengths_are_those_of_each_axis(
+    tmp_path: Path, changes: dict[str, Any], fx: float, fy: float, note: str
+) -> None:
+    model = read(write(tmp_path, {"w": 64, "h": 48, "frames": [FRAME]} | changes))
+    camera = model.sensors["camera1"].camera
+    assert camera is not None
+    assert camera.params == pytest.approx((fx, fy, 32, 24))
+    assert note in "\n".join(model.notes)
+    assert ("contradict" in "\n".join(model.notes)) == bool(note)
+
+
+@pytest.mark.parametrize(
+    ("frame", "top", "scale", "metric"),
+    [
+        ("depth_file_path", {}, 0.001, True),
+        ("depth_file_path", {"integer_depth_scale": 0.25}, 0.25, True),
+        ("depth_path", {"integer_depth_scale": 0.25}, 0.25, False),
+        ("depth_path", {"depth_unit_scale_factor": 1, "integer_depth_scale": 1.0}, 1, False),
+    ],
+)
+def test_depth_is_found_under_either_key_and_in_its_unit(
+    tmp_path: Path, frame: str, top: dict[str, Any], scale: float, metric: bool
+) -> None:
+    Image.new("I;16", (32, 24)).save(tmp_path / "d.png")
+    model = read(write(tmp_path, TOP | top | {"frames": [FRAME | {frame: "d.png"}]}))
+    assert [image.depth for image in model.images] == ["d.png"]
+    assert (model.depth_scale, model.metric) == (scale, metric)
+
+
+def test_masks_lie_where_a_build_looks_for_them(tmp_path: Path) -> None:
+    (tmp_path / "in" / "images").mkdir(parents=True)
+    (tmp_path / "in" / "masks").mkdir()
+    Image.new("RGB", (64, 48)).save(tmp_path / "in" / "images" / "0.jpg")
+    Image.new("L", (64, 48)).save(tmp_path / "in" / "masks" / "of 0.png")
+    frames = [
+        FRAME | {"mask_path": "./masks/of 0.png"},
+        FRAME | {"file_path": "1.jpg", "mask_path": "masks/gone.png"},
+    ]
+    folder = write(tmp_path / "in", TOP | {"frames": frames})
+    summary = import_dataset("nerfstudio", folder, tmp_path / "out")
+    assert summary.masks == 1
+    assert any("1 masks are missing: masks/gone.png" in note for note in summary.notes)
+    photos, notes = collect_photos(
+        read_dataset(tmp_path / "out"), posed=True, with_files=True, progress=lambda *_: None
+    )
+    (photo,), _ = masked(photos, tmp_path / "out" / MASKS)
+    assert photo.mask is not None
+    assert photo.mask.read_bytes() == (tmp_path / "in" / "masks" / "of 0.png").read_bytes()
 
 
 def frame_with(**changes: Any) -> Callable[[dict[str, Any]], dict[str, Any]]:
@@ -231,6 +301,15 @@ MIRRORED = np.diag([1.0, 1.0, -1.0, 1.0]).tolist()
         (frame_with(camera_model="EQUIRECTANGULAR"), "camera.model", "frames[1].camera_model"),
         (frame_with(file_path="images/0.jpg"), "import.photo_name", "images/0.jpg"),
         (top_with(fl_x=None), "import.json", "frames[0]"),
+        (top_with(fl_x=None, camera_angle_x=4.0), "import.json", "camera_angle_x"),
+        (top_with(fl_x=None, x_fov=-1), "import.json", "x_fov"),
+        (top_with(is_fisheye=1), "import.json", "is_fisheye"),
+        (top_with(integer_depth_scale=0), "import.json", "integer_depth_scale"),
+        (
+            top_with(depth_unit_scale_factor=0.001, integer_depth_scale=0.002),
+            *("import.json", "integer_depth_scale"),
+        ),
+        (frame_with(mask_path=3), "import.json", "frames[1].mask_path"),
         (top_with(w=None), "import.json", "frames[0]"),
         (top_with(frames=None), "import.json", "'frames'"),
         (top_with(frames=[]), "import.empty", ""),
