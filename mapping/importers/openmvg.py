@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.importers.model import ImportedImage, ImportedModel
-from mapping.importers.reading.json_fields import JsonValue, read_json
+from mapping.importers.reading.json_fields import JsonValue, notes_on_unread, read_json
 from mapping.importers.reading.photo_names import photo_names
 from mapping.importers.reading.tracks import Measurements, pose_from_center, rotation_from_matrix
 from mapping.importers.regions import PIXELS, with_features
@@ -99,7 +99,7 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
         np.zeros((len(points), 3), np.uint8),
         observations,
         keypoints_type=keypoints_type,
-        notes=(*notes, *feature_notes),
+        notes=(*notes, *feature_notes, *notes_on_unread(top)),
     )
 
 
@@ -182,7 +182,10 @@ def _flat(data: JsonValue) -> JsonValue:
     base = data.get("value0")
     if base is None or not isinstance(base.value, dict):
         return data
-    return JsonValue(_flat(base).value | data.value, data.file, data.parent, data.key)
+    own = {key: value for key, value in data.value.items() if key != "value0"}
+    data.value.clear()  # in place, so that its fields are counted where they are read
+    data.value.update(_flat(base).value | own)
+    return data
 
 
 def _read_intrinsics(array: JsonValue) -> tuple[dict[int, Camera], dict[str, set[int]]]:

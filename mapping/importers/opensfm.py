@@ -22,7 +22,7 @@ from mapping.frames.anchor import scale_doubt
 from mapping.importers.largest import ModelSize, largest_model
 from mapping.importers.model import ImportedImage, ImportedModel
 from mapping.importers.opensfm_features import Features, read_features
-from mapping.importers.reading.json_fields import JsonValue, read_json
+from mapping.importers.reading.json_fields import JsonValue, notes_on_unread, read_json
 from mapping.importers.reading.photo_names import photo_names
 from mapping.importers.reading.text_lines import TextLines
 from mapping.importers.reading.tracks import Measurements, keypoints_of
@@ -108,7 +108,7 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
         keypoints_type="opensfm",
         gnss=gnss,
         metric=metric,
-        notes=(*notes, *gnss_notes),
+        notes=(*notes, *gnss_notes, *notes_on_unread(reconstruction)),
     )
 
 

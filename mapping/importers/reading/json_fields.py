@@ -72,7 +72,9 @@ class JsonValue:
         if not isinstance(self.value, dict):
             raise self.error("the value is not an object", expected="an object")
         asked = self.asked.setdefault(key, {})
-        return JsonValue(self.value[key], self.file, self, key, asked) if key in self.value else None
+        if key not in self.value:
+            return None
+        return JsonValue(self.value[key], self.file, self, key, asked)
 
     def get_set(self, key: str) -> JsonValue | None:
         """Return a field of this object, None without it or where it is null."""
@@ -134,7 +136,7 @@ class JsonValue:
 
 
 def notes_on_unread(top: JsonValue) -> tuple[str, ...]:
-    """Count the fields in a value that nothing has asked for, those that are null aside."""
+    """Count the fields in a value that nothing has asked for, unless they are null or empty."""
     unread: Counter[str] = Counter()
     stack: list[tuple[Any, _Asked, str]] = [(top.value, top.asked, "")]
     while stack:
@@ -149,7 +151,7 @@ def notes_on_unread(top: JsonValue) -> tuple[str, ...]:
                 path = f"{place}.{'*' if key not in asked and within is not None else shown}"
                 if below is not None:
                     stack.append((inner, below, path))
-                elif inner is not None:
+                elif inner not in (None, [], {}):
                     unread[path.removeprefix(".")] += 1
     if not unread:
         return ()

@@ -262,7 +262,7 @@ def test_masks_lie_where_a_build_looks_for_them(tmp_path: Path) -> None:
     summary = import_dataset("nerfstudio", folder, tmp_path / "out")
     assert summary.masks == 1
     assert any("1 masks are missing: masks/gone.png" in note for note in summary.notes)
-    photos, notes = collect_photos(
+    photos, _ = collect_photos(
         read_dataset(tmp_path / "out"), posed=True, with_files=True, progress=lambda *_: None
     )
     (photo,), _ = masked(photos, tmp_path / "out" / MASKS)
