@@ -6,6 +6,7 @@ the name takes their place, and photos of one rig frame share the rank of the fi
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from mapping.importers.colmap_checks import check_model, has_model
 from mapping.importers.colmap_database import REFUSALS, Database, DatabaseImage, read_database
 from mapping.importers.largest import ModelSize, largest_model
 from mapping.importers.model import ImportedImage, ImportedModel
+from mapping.importers.reading.photo_names import photo_names
 from visloc.errors import DatasetError, InvalidInput, NotFound, VislocError, refuse
 from visloc.geometry import CAMERA_MODELS, Camera, Pose
 from visloc.kapture import GnssRecord, Sensor
@@ -116,17 +118,21 @@ def _database_in(places: Iterable[Path]) -> Path | None:
 
 
 def _reconstruction(folder: Path) -> pycolmap.Reconstruction:
-    check_model(folder)
-    try:
-        return pycolmap.Reconstruction(folder)
-    except REFUSALS as error:
-        raise refuse(
-            "import.colmap",
-            "the COLMAP model is damaged or not a COLMAP model",
-            field=str(folder),
-            expected="files that belong together",
-            got=str(error),
-        ) from error
+    with tempfile.TemporaryDirectory() as scratch:
+        names = check_model(folder, Path(scratch))
+        try:
+            model = pycolmap.Reconstruction(folder if names is None else scratch)
+            for image, name in (names or {}).items():
+                model.images[image].name = name
+        except REFUSALS as error:
+            raise refuse(
+                "import.colmap",
+                "the COLMAP model is damaged or not a COLMAP model",
+                field=str(folder),
+                expected="files that belong together",
+                got=str(error),
+            ) from error
+    return model
 
 
 def _model(
@@ -146,10 +152,11 @@ def _model(
         known, keypoints_type = database.images, database.keypoints_type
         notes += database.notes
     timestamps = _timestamps([(image.name, image.frame_id) for image in colmap_images])
+    paths = _paths(names, folder, photos, notes)
     with_keypoints = any(map(len, keypoints))
     images = tuple(
         ImportedImage(
-            name=image.name,
+            name=paths[image.name],
             sensor=_sensor_id(image.camera_id),
             timestamp=timestamps[image.name],
             cam_from_world=_pose(image, folder),
@@ -166,10 +173,7 @@ def _model(
         )
     points, colors, observations = _points(model, rows)
     users = {image.camera_id: image.name for image in colmap_images}
-    sensors = {
-        _sensor_id(key): _sensor(camera, folder, users.get(key))
-        for key, camera in sorted(model.cameras.items())
-    }
+    sensors = _sensors(model.cameras, users, folder, notes)
     gnss = _gnss(known, timestamps)
     return ImportedModel(
         sensors=sensors | _gnss_sensors(gnss),
@@ -189,15 +193,15 @@ def _model_of_database(database: Database, photos: Path | None) -> ImportedModel
     timestamps = _timestamps([(name, database.images[name].frame) for name in names])
     users = {database.images[name].camera: name for name in names}
     notes = [*database.notes, "a database has no poses: mapping build --poses estimate finds them"]
-    sensors = {}
+    paths = _paths(names, database.path, photos, notes)
+    sensors = _sensors(database.cameras, users, database.path, notes)
     guessed = []
     for key, camera in sorted(database.cameras.items()):
-        sensor = _sensor(camera, database.path, users.get(key))
-        if not camera.has_prior_focal_length:
+        sensor = sensors.get(_sensor_id(key))
+        if sensor is not None and not camera.has_prior_focal_length:
             guessed.append(str(key))
             size = (UNKNOWN_CAMERA, str(camera.width), str(camera.height))
-            sensor = Sensor(sensor.id, sensor.name, sensor.kind, size, None)
-        sensors[sensor.id] = sensor
+            sensors[sensor.id] = Sensor(sensor.id, sensor.name, sensor.kind, size, None)
     if guessed:
         notes.append(
             f"{len(guessed)} cameras have a focal length that COLMAP guessed, and become cameras "
@@ -208,7 +212,7 @@ def _model_of_database(database: Database, photos: Path | None) -> ImportedModel
         sensors=sensors | _gnss_sensors(gnss),
         images=tuple(
             ImportedImage(
-                name=name,
+                name=paths[name],
                 sensor=_sensor_id(database.images[name].camera),
                 timestamp=timestamps[name],
                 cam_from_world=None,
@@ -225,6 +229,16 @@ def _model_of_database(database: Database, photos: Path | None) -> ImportedModel
         gnss=gnss,
         notes=tuple(notes),
     )
+
+
+def _paths(names: list[str], source: Path, photos: Path | None, notes: list[str]) -> dict[str, str]:
+    """Return where each photo lies in the folder of photos: names may be those of Windows."""
+    folder = source if photos is None else photos
+    paths, more = photo_names(
+        [(name, f"{source}: image {name!r}") for name in names], folder, folder
+    )
+    notes += more
+    return dict(zip(names, paths, strict=True))
 
 
 def _belongs(
@@ -289,6 +303,23 @@ def _pose(image: pycolmap.Image, folder: Path) -> Pose | None:
 
 def _sensor_id(camera_id: int) -> str:
     return f"camera{camera_id}"
+
+
+def _sensors(
+    cameras: Mapping[int, pycolmap.Camera], users: Mapping[int, str], source: Path, notes: list[str]
+) -> dict[str, Sensor]:
+    """Return the sensors by id; those that no photo needs are left out where they cannot be had."""
+    sensors = {}
+    for key, camera in sorted(cameras.items()):
+        try:
+            sensor = _sensor(camera, source, users.get(key))
+        except DatasetError as error:
+            if key in users:
+                raise
+            notes.append(f"a camera that no photo has was left out: {error}")
+        else:
+            sensors[sensor.id] = sensor
+    return sensors
 
 
 def _sensor(camera: pycolmap.Camera, source: Path, image: str | None) -> Sensor:

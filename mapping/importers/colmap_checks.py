@@ -1,13 +1,18 @@
 """Checks of COLMAP models before pycolmap reads them.
 
 pycolmap takes what a file cut short leaves in memory for numbers, and says of bad text neither
-file nor line. Formats: COLMAP's documentation, "Output Format".
+file nor line. Of a text model it gets a copy in which both read the same: pycolmap cuts names at
+blanks, and drops the last image if the blank line of its keypoints is missing.
+
+Formats: COLMAP's documentation, "Output Format".
 """
 
 from __future__ import annotations
 
 import mmap
+import shutil
 import struct
+from codecs import BOM_UTF8
 from pathlib import Path
 
 import PIL.Image  # noqa: F401  Pillow saves PNGs only when it was imported before pycolmap
@@ -40,8 +45,15 @@ def has_model(folder: Path) -> bool:
     return _suffix(folder) is not None
 
 
-def check_model(folder: Path) -> None:
+def check_model(folder: Path, copy: Path) -> dict[int, str] | None:
     """Check the files of a model that pycolmap would read: the binary ones, else the text.
+
+    Args:
+        folder: with the model.
+        copy: an existing folder that gets a text model as it was read, with ids for names.
+
+    Returns:
+        The images' names by id; None for a binary model, which pycolmap can read as it is.
 
     Raises:
         DatasetError: ``import.colmap`` with the file, and the line of a text;
@@ -52,10 +64,29 @@ def check_model(folder: Path) -> None:
             path = folder / f"{name}.bin"
             if path.is_file():
                 _check_binary(path)
-    else:
-        cameras = _check_cameras_text(folder / "cameras.txt")
-        images = _check_images_text(folder / "images.txt", cameras)
-        _check_points_text(folder / "points3D.txt", images)
+        return None
+    cameras = _check_cameras_text(_copied(folder, copy, "cameras"))
+    images, names = _check_images_text(folder / "images.txt", cameras, copy / "images.txt")
+    _check_points_text(_copied(folder, copy, "points3D"), images)
+    for name in _OPTIONAL:
+        if (folder / f"{name}.txt").is_file():
+            _copied(folder, copy, name)
+    return names
+
+
+def _copied(folder: Path, copy: Path, name: str) -> Path:
+    """Copy a text file without its byte order mark, or link to it; return the original."""
+    path = folder / f"{name}.txt"
+    try:
+        with path.open("rb") as file:
+            if file.read(len(BOM_UTF8)) == BOM_UTF8:
+                with (copy / path.name).open("wb") as copied:
+                    shutil.copyfileobj(file, copied)
+            else:
+                (copy / path.name).symlink_to(path.resolve())
+    except OSError as error:
+        raise refuse("import.unreadable", field=str(path), got=error.strerror) from error
+    return path
 
 
 def _suffix(folder: Path) -> str | None:
@@ -205,11 +236,14 @@ def _check_cameras_text(path: Path) -> set[int]:
     return cameras
 
 
-def _check_images_text(path: Path, cameras: set[int]) -> dict[int, int]:
-    """Return the number of keypoints by image id."""
+def _check_images_text(
+    path: Path, cameras: set[int], copy: Path
+) -> tuple[dict[int, int], dict[int, str]]:
+    """Copy the file with ids for names; return the numbers of keypoints, and names, by id."""
     images: dict[int, int] = {}
-    names: set[str] = set()
-    with _ImageLines(path) as lines:
+    names: dict[int, str] = {}
+    known: set[str] = set()
+    with _ImageLines(path) as lines, copy.open("w", encoding="utf-8") as copied:
         while (line := _next_record(lines)) is not None:
             fields = line.split(maxsplit=9)
             if len(fields) != 10:
@@ -218,13 +252,6 @@ def _check_images_text(path: Path, cameras: set[int]) -> dict[int, int]:
                     "the line does not describe an image",
                     "id, qw qx qy qz, tx ty tz, camera, name",
                     fields[:10],
-                )
-            if len(fields[9].split()) > 1:  # pycolmap would read up to the blank
-                raise _bad(
-                    lines,
-                    "a text model cannot store this name; convert the model to binary",
-                    "a name without blanks",
-                    fields[9],
                 )
             image = lines.to_integer(fields[0], _MAX_ID)
             for number in fields[1:8]:
@@ -238,9 +265,10 @@ def _check_images_text(path: Path, cameras: set[int]) -> dict[int, int]:
                 )
             if image in images:
                 raise _bad(lines, "two images have the same id", "every id once", fields[0])
-            if fields[9] in names:
+            if fields[9] in known:
                 raise _twice(f"{path}:{lines.number}", fields[9])
-            names.add(fields[9])
+            known.add(fields[9])
+            names[image] = fields[9]
             keypoints = lines.next_line().split()
             if len(keypoints) % 3:
                 raise _bad(
@@ -255,7 +283,8 @@ def _check_images_text(path: Path, cameras: set[int]) -> dict[int, int]:
                 lines.to_number(keypoints[index + 1])
                 if keypoints[index + 2] not in _NO_POINT:
                     lines.to_integer(keypoints[index + 2], 2**63)
-    return images
+            copied.write(f"{' '.join(fields[:9])} {image}\n{' '.join(keypoints)}\n")
+    return images, names
 
 
 def _check_points_text(path: Path, images: dict[int, int]) -> None:

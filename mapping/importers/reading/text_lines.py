@@ -23,7 +23,7 @@ class TextLines:
         self.number = 0
         try:
             # Names may be in any coding; what is not UTF-8 is refused where names are checked.
-            self._file = path.open(encoding="utf-8", errors="surrogateescape", newline=None)
+            self._file = path.open(encoding="utf-8-sig", errors="surrogateescape", newline=None)
         except FileNotFoundError:
             raise refuse("import.missing", field=str(path)) from None
         except OSError as error:

@@ -77,6 +77,50 @@ def test_a_model_is_read_as_it_was_written(tmp_path: Path, write: Callable[[Path
     assert not model.metric
 
 
+BARE = "".join(line for line in IMAGES.splitlines(keepends=True) if ".jpg" in line)
+
+
+@pytest.mark.parametrize(
+    ("changes", "names"),
+    [
+        ({}, ["a/0.jpg", "a/one.jpg", "b/two.jpg"]),
+        ({"images": IMAGES.replace("b/two", "b/two (2)  x")}, ["b/two (2)  x.jpg"]),
+        ({"images": IMAGES.replace("b/two", "#2"), "points3D": "# none\n"}, ["#2.jpg"]),
+        ({"images": IMAGES.replace("b/two", "b\\two")}, ["b/two.jpg"]),
+        ({"images": IMAGES.replace("b/two", "C:\\photos\\two")}, ["two.jpg"]),
+        ({"images": IMAGES.replace("b/two", "/gone/two")}, ["two.jpg"]),
+        ({"images": BARE.replace(".jpg\n", ".jpg\n\n"), "points3D": ""}, ["b/two.jpg"]),
+        ({"images": BARE.replace(".jpg\n", ".jpg\n\n").rstrip(), "points3D": ""}, ["a/one.jpg"]),
+        (
+            {"images": BARE.replace(".jpg\n", ".jpg\r\n\r\n").rstrip(), "points3D": ""},
+            ["a/one.jpg"],
+        ),
+        (
+            {"cameras": f"\ufeff# 2\n{CAMERAS}", "images": f"\ufeff{IMAGES}"},
+            ["b/two.jpg"],
+        ),
+        ({"cameras": f"\ufeff{CAMERAS}", "points3D": f"\ufeff# 2\n{POINTS}"}, ["b/two.jpg"]),
+    ],
+)
+def test_every_image_of_a_text_keeps_its_name(
+    tmp_path: Path, changes: dict[str, str], names: list[str]
+) -> None:
+    model = read(write_text(tmp_path, **changes))
+    assert len(model.images) == 3
+    assert set(names) <= {image.name for image in model.images}
+    assert len(model.points) == (2 if changes.get("points3D", POINTS).endswith(POINTS) else 0)
+
+
+def test_a_camera_that_no_photo_has_is_left_out_where_kapture_lacks_its_model(
+    tmp_path: Path,
+) -> None:
+    model = read(
+        write_text(tmp_path, cameras=f"{CAMERAS}7 SIMPLE_DIVISION 640 480 500 320 240 0\n")
+    )
+    assert list(model.sensors) == ["camera1", "camera2"]
+    assert any("left out" in note and "SIMPLE_DIVISION" in note for note in model.notes)
+
+
 def test_a_real_model_becomes_a_dataset_with_the_same_cameras_poses_and_points(
     lund: Path, tmp_path: Path
 ) -> None:
@@ -296,7 +340,6 @@ def test_files_that_do_not_belong_together_are_refused(tmp_path: Path) -> None:
         ("cameras", "2 SIMPLE", "1 SIMPLE", 2, "import.colmap"),
         ("images", " 2 a/0", " 7 a/0", 3, "import.colmap"),
         ("images", "0.5 0.5", "0.5 x", 3, "import.line"),
-        ("images", "b/two", "b two", 1, "import.colmap"),
         ("images", "30.5 40.5 -1", "30.5 40.5", 2, "import.colmap"),
         ("images", "b/two.jpg", "a/one.jpg", 5, "import.duplicate_image"),
         ("points3D", "1 2 3 10", "1 inf 3 10", 1, "import.line"),
