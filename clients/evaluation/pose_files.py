@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -64,11 +64,13 @@ def of_photos(found: Mapping[str, _T], photos: Iterable[str]) -> tuple[dict[str,
     with it, as visuallocalization.net has base names for some data sets.
 
     Returns:
-        The values by the photos' names, and the number of names that stand for no photo.
+        The values by the photos' names, and the number of names that stand for no photo; those that
+        begin with ``#``, as comments do, aside.
 
     Raises:
-        DatasetError: ``poses.ambiguous`` when a name ends the paths of several photos;
-            ``poses.duplicate`` when two names stand for one photo.
+        DatasetError: ``poses.ambiguous`` when a name ends the paths of several photos, or is that
+            of one as it stands and of another decoded; ``poses.duplicate`` when two names stand
+            for one photo.
     """
     photos = list(photos)
     exact = set(photos)
@@ -81,13 +83,13 @@ def of_photos(found: Mapping[str, _T], photos: Iterable[str]) -> tuple[dict[str,
     unknown = 0
     for name, value in found.items():
         # Our own files write a blank as %20; other tools' files do not decode names.
-        spellings = (name, unquote(name))
-        known = [each for each in spellings if each in exact][:1]
+        spellings = dict.fromkeys((name, unquote(name)))
+        known = [each for each in spellings if each in exact]
         fits = known or next((ending[each] for each in spellings if each in ending), [])
         if len(fits) > 1:
             raise refuse("poses.ambiguous", field=name, got=", ".join(fits[:3]))
         if not fits:
-            unknown += 1
+            unknown += not name.startswith("#")
         elif fits[0] in values:
             raise refuse("poses.duplicate", field=name, got=fits[0])
         else:
@@ -105,24 +107,37 @@ def _of_results(path: Path) -> Iterator[tuple[str, KnownPose]]:
 
 def _of_text(path: Path) -> dict[str, KnownPose]:
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        lines = path.read_text(encoding="utf-8-sig").split("\n")
     except (OSError, UnicodeDecodeError) as error:
         raise refuse("poses.unreadable", field=str(path), got=str(error)) from error
     poses: dict[str, KnownPose] = {}
     for number, line in enumerate(lines, start=1):
-        fields = line.split()
-        if not fields or fields[0].startswith("#"):
+        fields, where = line.split(), f"{path}:{number}"
+        if not fields:
             continue
-        where = f"{path}:{number}"
-        if len(fields) != 8:
-            raise refuse("poses.line", field=where, got=f"{len(fields)} fields: {line.strip()}")
-        if fields[0] in poses:
-            raise refuse("poses.duplicate", field=where, got=fields[0])
+        name = fields[0]
+        is_comment = name.startswith("#")  # or the pose of a photo of such a name
         try:
-            numbers = [float(field) for field in fields[1:]]
-            poses[fields[0]] = KnownPose(Pose.from_quaternion(numbers[:4], numbers[4:]))
-        except InvalidInput as error:
-            raise error.about(where, DatasetError) from None
-        except ValueError:
-            raise refuse("poses.line", field=where, got=line.strip()) from None
+            pose = _pose_in(fields, where)
+        except DatasetError:
+            if is_comment:
+                continue
+            raise
+        if name not in poses:
+            poses[name] = KnownPose(pose)
+        elif not is_comment:
+            raise refuse("poses.duplicate", field=where, got=name)
     return poses
+
+
+def _pose_in(fields: Sequence[str], where: str) -> Pose:
+    try:
+        numbers = [float(field) for field in fields[1:]]
+    except ValueError:
+        numbers = []
+    if len(numbers) != 7:
+        raise refuse("poses.line", field=where, got=f"{len(fields)} fields: {' '.join(fields)}")
+    try:
+        return Pose.from_quaternion(numbers[:4], numbers[4:])
+    except InvalidInput as error:
+        raise error.about(where, DatasetError) from None

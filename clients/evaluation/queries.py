@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import os
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from visloc.errors import DatasetError, InvalidInput, refuse
-from visloc.geometry import Camera, PixelOrigin, Pose
+from visloc.geometry import CAMERA_MODELS, Camera, PixelOrigin, Pose
 from visloc.kapture import read_dataset
-from visloc.kapture.text import relative_path
+from visloc.kapture.text import plain_name, relative_path
 
 _UNKNOWN_CAMERA = "UNKNOWN_CAMERA"
+_MODELS = "|".join((_UNKNOWN_CAMERA, *CAMERA_MODELS))
+_WITH_CAMERA = re.compile(rf"(.*\S)\s+((?:{_MODELS})(?:\s.*)?)")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,9 +64,10 @@ def read_queries(
 ) -> QuerySet:
     """Read a kapture folder or a text file that lists photos, in their order.
 
-    Each line of a list is ``image_name`` or ``image_name MODEL width height params...``,
-    separated by blanks. Empty lines and those that begin with ``#`` are skipped. For
-    UNKNOWN_CAMERA, here or in kapture, no camera is sent. Principal points count from ``origin``.
+    Each line of a list is ``image_name`` or ``image_name MODEL width height params...``, separated
+    by blanks, which names of photos may hold as well. Empty lines, and those that begin with ``#``
+    and are not about a photo of such a name, are skipped. For UNKNOWN_CAMERA, here or in kapture,
+    no camera is sent. Principal points count from ``origin``.
 
     Args:
         source: the folder, the list, or a pattern of lists such as ``queries/*_time_queries.txt``.
@@ -133,23 +138,39 @@ def _read_lists(
 
 def _read_list(path: Path, origin: PixelOrigin, folder: Path) -> list[Query]:
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        lines = path.read_text(encoding="utf-8-sig").split("\n")
     except (OSError, UnicodeDecodeError) as error:
         raise refuse("list.unreadable", field=str(path), got=str(error)) from error
     queries: dict[str, Query] = {}
     for number, line in enumerate(lines, start=1):
-        fields = line.split()
-        if not fields or fields[0].startswith("#"):
+        text, fields = _name_and_camera(line.strip(), folder)
+        if not text or (text.startswith("#") and not _is_photo(folder, text)):
             continue
         where = f"{path}:{number}"
-        name = _parse_name(where, fields[0])
+        name = _parse_name(where, text)
         if name in queries:
             raise refuse("list.duplicate", field=where, got=name)
-        camera = _parse_camera(where, fields[1:])
+        camera = _parse_camera(where, fields)
         if camera is not None:
             camera = camera.with_pixels_from(origin)
         queries[name] = Query(name, folder / name, camera, None)
     return list(queries.values())
+
+
+def _name_and_camera(line: str, folder: Path) -> tuple[str, list[str]]:
+    """Split a line before the model of its camera, or else at its first blank."""
+    if _is_photo(folder, line):
+        return line, []
+    name, *camera = (
+        found.groups()
+        if (found := _WITH_CAMERA.fullmatch(line))
+        else line.split(maxsplit=1) or [""]
+    )
+    return name, " ".join(camera).split()
+
+
+def _is_photo(folder: Path, name: str) -> bool:
+    return os.path.isfile(folder / plain_name(name))  # noqa: PTH113 - is_file raises
 
 
 def _parse_name(where: str, text: str) -> str:

@@ -148,8 +148,9 @@ def copy_lines(
 def write_poses(path: Path, poses: Iterable[tuple[str, PoseEstimate | CoarsePose | Pose]]) -> None:
     """Write ``name qw qx qy qz tx ty tz`` lines of ``cam_from_world``, every digit as received.
 
-    Readers of this format split at blanks, so blanks in a name, and ``%``, are percent-encoded:
-    ``a b.jpg`` becomes ``a%20b.jpg``, and ``urllib.parse.unquote`` gives the name back.
+    Readers of this format split at blanks and skip lines that begin with ``#``, so these, ``%`` and
+    a byte order mark are percent-encoded in names: ``a b.jpg`` becomes ``a%20b.jpg``, and
+    ``urllib.parse.unquote`` gives the name back.
     """
     write_whole(path, (_pose_line(name, pose).encode() for name, pose in poses))
 
@@ -236,7 +237,7 @@ def _fill(entry: dict[str, Any], pose: TracedPose) -> None:
 
 def _pose_line(name: str, pose: PoseEstimate | CoarsePose | Pose) -> str:
     numbers = (repr(float(value)) for value in (*pose.rotation_wxyz, *pose.translation))
-    encoded = re.sub(r"[\s%]", lambda found: quote(found[0]), name)
+    encoded = re.sub(r"^#|[\s%\ufeff]", lambda found: quote(found[0]), name)
     return f"{encoded} {' '.join(numbers)}\n"
 
 

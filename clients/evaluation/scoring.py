@@ -14,6 +14,7 @@ from clients.evaluation.pose_files import KnownPose, of_photos, read_poses
 from visloc.accuracy import Compared, accuracy_of
 from visloc.errors import refuse
 from visloc.evaluation import Threshold
+from visloc.kapture.text import plain_name
 
 _AVERAGED = (
     *("median_position_error_m", "median_orientation_error_deg"),
@@ -93,7 +94,8 @@ def read_scene(poses: Path, truth: Path) -> Scene:
 def read_conditions(patterns: Sequence[str], listed: Path | None) -> Conditions:
     """Parse texts ``NAME=PATTERN``, and a file with lines ``photo condition``.
 
-    The fields of a line are separated by a comma or by blanks.
+    The fields of a line are separated by a comma or by blanks. Lines that begin with ``#`` are
+    skipped; ``./#1.jpg`` is the photo ``#1.jpg``.
 
     Raises:
         InvalidInput: ``conditions.syntax``.
@@ -168,7 +170,7 @@ def _average(rows: Sequence[Mapping[str, Any]], thresholds: Sequence[Threshold])
 
 def _listed(path: Path) -> dict[str, str]:
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        lines = path.read_text(encoding="utf-8-sig").split("\n")
     except (OSError, UnicodeDecodeError) as error:
         raise refuse("conditions.unreadable", field=str(path), got=str(error)) from error
     found: dict[str, str] = {}
@@ -177,7 +179,8 @@ def _listed(path: Path) -> dict[str, str]:
         if not text or text.startswith("#"):
             continue
         fields = [part.strip() for part in (text.split(",") if "," in text else text.split())]
-        if len(fields) != 2 or not all(fields) or fields[0] in found:
+        name = plain_name(fields[0])
+        if len(fields) != 2 or not all(fields) or name in found:
             raise refuse("conditions.line", field=f"{path}:{number}", got=text)
-        found[fields[0]] = fields[1]
+        found[name] = fields[1]
     return found

@@ -11,7 +11,6 @@ from mapping.pairing.ranking import unite
 from mapping.pairing.scene import Pairs, Scene
 from visloc.kapture.matches import MatchFiles
 from visloc.kapture.pairs import PairRow, read_pair_rows, write_pair_rows
-from visloc.kapture.text import relative_path
 
 
 def write_pairs(path: Path, scene: Scene, pairs: Pairs) -> None:
@@ -63,11 +62,6 @@ def matched_pairs(matches: MatchFiles, scene: Scene) -> Pairs:
 
 def _row(row_of: dict[str, int], name: str, pair: PairRow) -> int:
     row = row_of.get(name)
-    if row is None:
-        try:
-            row = row_of.get(relative_path(name))  # such as ./a.jpg or a\b.jpg
-        except ValueError:
-            row = None
     if row is None:
         raise pair.table.error("pairs.unknown_photo", got=name)
     return row

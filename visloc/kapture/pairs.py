@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from visloc.errors import refuse
 from visloc.kapture.table import Table
-from visloc.kapture.text import is_field
+from visloc.kapture.text import is_field, plain_name
 from visloc.kapture.writer import write_atomically
 
 _HEADER = "# query_image, map_image, score"
@@ -32,7 +32,7 @@ def read_pair_rows(path: Path) -> Iterator[PairRow]:
     """Read lines of two names, and a score or none.
 
     kapture separates them by commas, hloc by blanks. A line with a comma is kapture's, so its names
-    may have blanks. Comments and blank lines are ignored.
+    may have blanks. Comments and blank lines are ignored; ``./#1.jpg`` is the photo ``#1.jpg``.
 
     Raises:
         DatasetError: with file and line; ``kapture.unreadable``, ``kapture.encoding``,
@@ -44,7 +44,7 @@ def read_pair_rows(path: Path) -> Iterator[PairRow]:
         if len(parts) not in (2, 3):
             raise table.error("pairs.column_count", got=len(parts))
         score = table.numbers(parts[2:])[0] if len(parts) == 3 else None
-        yield PairRow(parts[0], parts[1], score, table)
+        yield PairRow(plain_name(parts[0]), plain_name(parts[1]), score, table)
 
 
 def check_pair_names(path: Path, names: Iterable[str]) -> None:
@@ -61,12 +61,15 @@ def check_pair_names(path: Path, names: Iterable[str]) -> None:
 def write_pair_rows(path: Path, rows: Iterable[tuple[str, str, float]]) -> None:
     """Write pairs as kapture has them, scores exactly; a file there is replaced.
 
+    A name that begins with ``#``, as comments do, is written as ``./#``.
+
     Raises:
         DatasetError: ``kapture.field`` for a name with a comma, or that would not be read as it is.
     """
     lines = [_HEADER]
     for first, second, score in rows:
         check_pair_names(path, (first, second))
-        lines.append(f"{first}, {second}, {score!r}")
+        here = "./" if first.startswith("#") else ""
+        lines.append(f"{here}{first}, {second}, {score!r}")
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, ("\n".join(lines) + "\n").encode("utf-8"))

@@ -27,6 +27,14 @@ def relative_path(text: str) -> str:
     return path.as_posix()
 
 
+def plain_name(text: str) -> str:
+    """Return the name of a photo without ``./``; what is no relative path, so no name, stays."""
+    try:
+        return relative_path(text)
+    except ValueError:
+        return text
+
+
 def has_control_characters(text: str) -> bool:
     """Tell whether a text has line breaks, tabs, NUL or lone surrogates."""
     return not text.isprintable() and any(unicodedata.category(c) in ("Cc", "Cs") for c in text)
