@@ -152,12 +152,14 @@ def import_features_command(
     ] = "hloc",
 ) -> None:
     """Write features and matches of hloc in kapture's layout, for build and localize batch."""
-    written = import_features(files, output, type_name)
+    written, notes = import_features(files, output, type_name)
+    local, of_whole, pairs = (written.get(kind, 0) for kind in ("local", "global", "pairs"))
     say(
-        f"{written['local']} photos with local features, {written['global']} with global ones, "
-        f"{written['pairs']} pairs with matches: {output}"
+        f"{local} photos with local features, {of_whole} with global ones, "
+        f"{pairs} pairs with matches: {output}"
     )
-    if written["pairs"]:
+    say_notes(notes)
+    if pairs:
         say(f"next: --matches-dir {output / 'reconstruction' / 'matches' / type_name}")
 
 

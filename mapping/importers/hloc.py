@@ -25,9 +25,17 @@ from visloc.kapture.matches import write_matches
 
 # More than any photo has: 200 000 descriptors of 256 numbers are 51 millions.
 _MAX_VALUES = 2**26
+# What is read of a group, by the array that tells what the group is.
+_ARRAYS = {
+    "keypoints": ("keypoints", "descriptors"),
+    "global_descriptor": ("global_descriptor",),
+    "matches0": ("matches0", "matching_scores0"),
+}
 
 
-def import_features(files: Sequence[Path], output: Path, type_name: str) -> Counter[str]:
+def import_features(
+    files: Sequence[Path], output: Path, type_name: str
+) -> tuple[dict[str, int], list[str]]:
     """Write features and matches of hloc in kapture's layout, in the order features, matches.
 
     Args:
@@ -36,7 +44,8 @@ def import_features(files: Sequence[Path], output: Path, type_name: str) -> Coun
         type_name: TYPE.
 
     Returns:
-        How many photos have local and global features, and how many pairs have matches.
+        How many photos have local and global features, and how many pairs have matches; and a note
+        on what is not read.
 
     Raises:
         InvalidInput: ``hloc.h5py``.
@@ -45,27 +54,33 @@ def import_features(files: Sequence[Path], output: Path, type_name: str) -> Coun
     """
     if importlib.util.find_spec("h5py") is None:
         raise refuse("hloc.h5py")
-    written: Counter[str] = Counter()
+    written: dict[str, set[str]] = {"local": set(), "global": set(), "pairs": set()}
+    unread: Counter[str] = Counter()
     sizes: dict[str, int] = {}
     for file in files:
         for name, group in _groups(file):
+            known = [key for kind, keys in _ARRAYS.items() if kind in group for key in keys]
+            unread.update(key for key in _arrays(group) if key not in known)
             if "keypoints" in group:
                 sizes[name] = _local(file, name, group, output, type_name)
-                written["local"] += 1
+                written["local"].add(name)
             if "global_descriptor" in group:
                 vector = _numbers(file, name, group, "global_descriptor", 1)
                 write_global_features(output, type_name, name, vector, name=type_name)
-                written["global"] += 1
-    short = _short_names(sizes)
+                written["global"].add(name)
+            if "matches0" in group:
+                written["pairs"].add(name)
+    if not any(written.values()):
+        raise refuse("hloc.nothing", field=", ".join(map(str, files)))
+    short = _short_names(sizes) if written["pairs"] else {}
     folder = output / "reconstruction" / "matches" / type_name
-    for file in files:
+    for file in files if written["pairs"] else ():
         for name, group in _groups(file):
             if "matches0" in group:
                 _matches(file, name, group, short, sizes, folder)
-                written["pairs"] += 1
-    if not written:
-        raise refuse("hloc.nothing", field=", ".join(map(str, files)))
-    return written
+    some = ", ".join(f"{key} ({count})" for key, count in unread.most_common(10))
+    notes = [f"arrays that are not read, and how often: {some}"] if unread else []
+    return {kind: len(names) for kind, names in written.items() if names}, notes
 
 
 def _local(file: Path, name: str, group: Any, output: Path, type_name: str) -> int:
@@ -134,16 +149,23 @@ def _groups(file: Path) -> Iterator[tuple[str, Any]]:
         names: list[str] = []
 
         def visit(name: str, item: Any) -> None:
-            if isinstance(item, h5py.Group) and any(
-                isinstance(item.get(key, getlink=True), h5py.HardLink)
-                and item.get(key, getclass=True) is h5py.Dataset
-                for key in item
-            ):
+            if isinstance(item, h5py.Group) and _arrays(item):
                 names.append(name)
 
         opened.visititems(visit)
         for name in names:
             yield name, opened[name]
+
+
+def _arrays(group: Any) -> list[str]:
+    import h5py
+
+    return [
+        key
+        for key in group
+        if isinstance(group.get(key, getlink=True), h5py.HardLink)
+        and group.get(key, getclass=True) is h5py.Dataset
+    ]
 
 
 def _numbers(file: Path, name: str, group: Any, key: str, num_axes: int) -> NDArray[np.float32]:

@@ -93,7 +93,7 @@ def test_castle_is_mapped_and_localized_from_hlocs_files(shared_data: Path, tmp_
     files, by_kapture = write_hloc(tmp_path, mapping, query)
     imported = tmp_path / "imported"
 
-    assert import_features(files, imported, "xf") == {"local": 30, "pairs": 399}
+    assert import_features(files, imported, "xf")[0] == {"local": 30, "pairs": 399}
     matches = imported / "reconstruction" / "matches" / "xf"
     poses = {}
     for name, folder, sfm in (

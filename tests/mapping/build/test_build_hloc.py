@@ -139,9 +139,10 @@ def test_hlocs_files_become_the_map_and_the_poses_of_the_same_features(
 ) -> None:
     imported = tmp_path / "imported"
 
-    written = import_features([hloc.matches, hloc.features], imported, "hloc")
+    written, notes = import_features([hloc.matches, hloc.features], imported, "hloc")
 
     assert written == {"local": 21, "global": 16, "pairs": 120}
+    assert notes == ["arrays that are not read, and how often: scores (21), image_size (21)"]
     settings: dict[str, Any] = {"local_features": "kapture:hloc"}
     by_kapture = build_walk(
         *(walk / "mapping", tmp_path / "by_kapture"),
@@ -300,8 +301,26 @@ BAD: list[tuple[dict[str, Any], dict[str, Any], str]] = [
     ({}, {"a.jpg/b-1.jpg/matches0": np.array([0, 1, -2])}, "hloc.group"),
     ({}, {"a.jpg/c.jpg/matches0": np.array([0, 1, 2])}, "hloc.pair"),
     ({}, {"a.jpg_b-1.jpg/matches0": np.array([0, 1, 2])}, "hloc.pair"),
-    ({}, {"b-1.jpg/keypoints": np.ones((1, 2))}, "hloc.pair"),
+    (
+        {},
+        {"b-1.jpg/keypoints": np.ones((1, 2)), "a.jpg/b-1.jpg/matches0": np.array([0, 1, 2])},
+        "hloc.pair",
+    ),
 ]
+
+
+def test_features_alone_need_no_names_of_pairs(tmp_path: Path) -> None:
+    path = tmp_path / "features.h5"
+    with h5py.File(path, "w") as file:
+        _photo(file, "db/1.jpg", scores=np.ones(3))
+        _photo(file, "db-1.jpg", own=np.ones(1), scores=np.ones(3))
+        file["c.jpg/descriptors"] = np.ones((4, 3))
+    written, notes = import_features([path], tmp_path / "out", "hloc")
+    assert written == {"local": 2}
+    assert notes == [
+        "arrays that are not read, and how often: scores (2), descriptors (1), own (1)"
+    ]
+    assert import_features([path, path], tmp_path / "out2", "hloc")[0] == {"local": 2}
 
 
 @pytest.mark.parametrize(("photo", "more", "code"), BAD)
