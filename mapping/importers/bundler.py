@@ -63,7 +63,7 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
     path = _bundle_file(path)
     list_file = _list_file(path, photos)
     photos = list_file.parent if photos is None else photos
-    named = _read_list(list_file)
+    named, num_focal = _read_list(list_file)
     num_cameras = len(named)
     with TextLines(path) as lines:
         num_points = _read_header(lines, num_cameras, list_file)
@@ -75,6 +75,7 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
             points.append(lines.next_numbers(3, "X Y Z of a point"))
             colors.append(_read_color(lines))
             rows += _read_view_list(lines, point, num_cameras)
+        lines.end("its last point")
 
     names, notes = photo_names(named, list_file.parent, photos)
     sizes = [photo_size(photos / name) for name in names]
@@ -90,6 +91,8 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
         images.append(ImportedImage(names[index], id_, index, pose))
     if num_lost := sum(cameras[index] is None for index in kept):
         notes += (f"{num_lost} of {len(kept)} photos were not reconstructed",)
+    if num_focal:
+        notes += (f"{num_focal} focal lengths in {list_file.name} are not read",)
     notes += _note_on_visualsfm([camera for camera in cameras if camera is not None])
     model = ImportedModel(
         sensors,
@@ -141,13 +144,15 @@ def _list_file(path: Path, photos: Path | None) -> Path:
     )
 
 
-def _read_list(path: Path) -> list[tuple[str, str]]:
-    named = []
+def _read_list(path: Path) -> tuple[list[tuple[str, str]], int]:
+    """Return the photos and where they are named, and how many lines have a focal length."""
+    named, num_focal = [], 0
     with TextLines(path) as lines:
         while (line := lines.next_or_none()) is not None:
             with_focal = _LIST_WITH_FOCAL.fullmatch(line)  # NAME 0 FOCAL, as Bundler writes it
+            num_focal += with_focal is not None
             named.append((with_focal["name"] if with_focal else line, f"{path}:{lines.number}"))
-    return named
+    return named, num_focal
 
 
 def _note_on_visualsfm(cameras: Sequence[_CameraBlock]) -> tuple[str, ...]:

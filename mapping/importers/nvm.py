@@ -88,6 +88,9 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
         parts = []
         while (part := _read_part(lines, has_matrices)) is not None:
             parts.append(part)
+        rest = 0
+        while (line := lines.next_or_none()) is not None:
+            rest += line != "0" and not line.startswith("#")
     if not parts:
         raise refuse("import.empty", "the file holds no model", field=str(path))
     sizes = [
@@ -95,6 +98,8 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
         for number, part in enumerate(parts)
     ]
     largest, notes = largest_model("the file", sizes)
+    if rest:  # of point clouds in PLY files
+        notes.append(f"{rest} lines after the models are not read")
     return _model(path, photos, parts[largest], fixed, notes)
 
 
@@ -143,7 +148,9 @@ def _read_header(lines: TextLines) -> tuple[_Calibration | None, bool]:
         raise lines.error(
             "the calibration is unknown", expected="FixedK fx cx fy cy", got=" ".join(fields[1:])
         )
-    fx, cx, fy, cy = (lines.to_number(field) for field in fields[2:6])
+    fx, cx, fy, cy, *others = (lines.to_number(field) for field in fields[2:])
+    if any(others):
+        raise lines.error("the calibration has more than is read", expected="4 numbers", got=others)
     if min(fx, fy) < _MIN_FOCAL:
         raise lines.error(
             "the focal length is not valid", expected=f"at least {_MIN_FOCAL} px", got=[fx, fy]
@@ -173,7 +180,9 @@ def _read_camera(lines: TextLines, has_matrices: bool) -> _CameraLine:
             expected=f"a name and {num_numbers} numbers",
             got=len(fields),
         )
-    focal, *numbers, k, _ = (lines.to_number(field) for field in fields)
+    focal, *numbers, k, end = (lines.to_number(field) for field in fields)
+    if end:
+        raise lines.error("the line goes on after the distortion", expected="0", got=end)
     if focal < _MIN_FOCAL:
         raise lines.error(
             "the focal length is not valid", expected=f"at least {_MIN_FOCAL} px", got=focal

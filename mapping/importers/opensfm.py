@@ -10,6 +10,7 @@ z up from ``reference_lla``. The matches are pickles and are never opened.
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -90,6 +91,10 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
     features = read_features(folder / "features", names)
     if features is not None:
         images = _with_features(images, features, sizes)
+        unread = Counter(name for found in features for name in found.unread)
+        if unread:
+            some = ", ".join(f"{name!r} ({count})" for name, count in unread.most_common(10))
+            notes.append(f"arrays of the features that are not read: {some}")
         observations = _checked_rows(folder / "tracks.csv", measurements, features)
     else:
         notes.append("not all photos have features; the observations are the keypoints")
@@ -228,14 +233,14 @@ def _camera(kind: str, value: JsonValue) -> Camera | None:
 
 def _read_shot(name: str, value: JsonValue) -> _Shot:
     rotation = Rotation.from_rotvec(value["rotation"].numbers(3)).as_matrix()
-    gps, dop = value.get("gps_position"), value.get("gps_dop")
+    gps, dop = value.get_set("gps_position"), value.get_set("gps_dop")
     return _Shot(
         value,
         name,
         value["camera"].text(),
         Pose(rotation, np.array(value["translation"].numbers(3))),
-        None if gps is None or gps.value is None else gps.numbers(3),
-        0.0 if dop is None or dop.value is None else dop.number(),
+        None if gps is None else gps.numbers(3),
+        0.0 if dop is None else dop.number(),
     )
 
 

@@ -29,11 +29,13 @@ class Features:
         path: the file.
         points: (n, 4) float32: x, y, size (normalized) and angle in degrees.
         descriptors: (n, D) uint8 or float32.
+        unread: the names of other arrays.
     """
 
     path: Path
     points: NDArray[np.float32]
     descriptors: NDArray[Any]
+    unread: tuple[str, ...]
 
 
 def read_features(folder: Path, names: Sequence[str]) -> list[Features] | None:
@@ -71,6 +73,7 @@ def _read(path: Path) -> Features:
         with zipfile.ZipFile(path) as archive:
             points = _array(path, archive, "points")
             descriptors = _array(path, archive, "descriptors")
+            unread = tuple(sorted(set(archive.namelist()) - {"points.npy", "descriptors.npy"}))
     except (OSError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:
         raise _error(path, "the archive cannot be read", None, str(error)) from error
     if points.shape[1] != 4 or points.dtype.kind != "f" or not _is_sane(points):
@@ -83,12 +86,12 @@ def _read(path: Path) -> Features:
             str(len(descriptors)),
         )
     if descriptors.dtype == np.uint8:
-        return Features(path, points.astype(np.float32), descriptors)
+        return Features(path, points.astype(np.float32), descriptors, unread)
     if descriptors.dtype.kind != "f" or not _is_sane(descriptors):
         raise _error(
             path, "the descriptors are not valid", "bytes or finite floats", _kind(descriptors)
         )
-    return Features(path, points.astype(np.float32), descriptors.astype(np.float32))
+    return Features(path, points.astype(np.float32), descriptors.astype(np.float32), unread)
 
 
 def _array(path: Path, archive: zipfile.ZipFile, name: str) -> NDArray[Any]:

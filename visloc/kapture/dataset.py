@@ -142,8 +142,10 @@ class Dataset:
         The sensor's own trajectory has priority over those of its rigs.
         """
         own = self.trajectories.get((record.timestamp, record.sensor_id))
-        if own is not None:
-            return own
+        return self.pose_by_rig(record) if own is None else own
+
+    def pose_by_rig(self, record: FileRecord) -> Pose | None:
+        """Return ``sensor_from_world`` by the first of the sensor's rigs that has a pose."""
         for rig_id in self._rigs_of_sensor.get(record.sensor_id, ()):
             sensor_from_rig = self.rigs[rig_id][record.sensor_id]
             rig_from_world = self.trajectories.get((record.timestamp, rig_id))

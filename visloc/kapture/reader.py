@@ -8,9 +8,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Container, Mapping
+from dataclasses import replace
 from pathlib import Path
 
-from visloc.geometry import CAMERA_MODELS, MAX_IMAGE_SIDE, Camera, Pose
+import numpy as np
+
+from visloc.geometry import CAMERA_MODELS, MAX_IMAGE_SIDE, Camera, Pose, rotation_angle
 from visloc.kapture.dataset import (
     UNKNOWN_CAMERA,
     Dataset,
@@ -19,11 +22,16 @@ from visloc.kapture.dataset import (
     RecordFiles,
     Sensor,
 )
-from visloc.kapture.other_sensors import read_other_records
+from visloc.kapture.other_sensors import OTHER_FILES, read_other_records
 from visloc.kapture.rigs import unroll_rigs
 from visloc.kapture.table import Table
 
 _NEWEST_VERSION = (1, 1)
+_SAME = 1e-4  # relative, and in radians: of the numbers of a pose, four digits agree
+_TABLES = {
+    *("sensors.txt", "rigs.txt", "trajectories.txt", "records_camera.txt", "records_depth.txt"),
+    *("records_gnss.txt", *OTHER_FILES),
+}
 
 
 def read_dataset(root: Path, files: RecordFiles | None = None) -> Dataset:
@@ -48,7 +56,31 @@ def read_dataset(root: Path, files: RecordFiles | None = None) -> Dataset:
     gnss = _read_gnss(root, sensors, notes)
     records = images, depth_maps, gnss
     other = read_other_records(root)
-    return Dataset(root, sensors, rigs, trajectories, *records, tuple(notes), files, other)
+    found = {path.name for path in (root / "sensors").glob("*.txt")}
+    notes += [f"sensors/{name} is not read" for name in sorted(found - _TABLES)]
+    dataset = Dataset(root, sensors, rigs, trajectories, *records, (), files, other)
+    return replace(dataset, notes=(*notes, *_notes_on_rigs(dataset)))
+
+
+def _notes_on_rigs(dataset: Dataset) -> list[str]:
+    """Name the photos whose own pose is not the one that their rig tells."""
+    off = []
+    for record in dataset.images:
+        own = dataset.trajectories.get((record.timestamp, record.sensor_id))
+        told = None if own is None else dataset.pose_by_rig(record)
+        if own is not None and told is not None:
+            far = float(np.linalg.norm(own.center - told.center))
+            if far > _SAME * np.abs(own.center).max() or (
+                rotation_angle(own.rotation @ told.rotation.T) > _SAME
+            ):
+                off.append((far, record.path))
+    if not off:
+        return []
+    far, path = max(off)
+    return [
+        f"{len(off)} photos have a pose of their own that contradicts that of their rig, which was "
+        f"not used: {path} is {far:.3g} units from there"
+    ]
 
 
 def _read_sensors(root: Path, notes: list[str]) -> dict[str, Sensor]:

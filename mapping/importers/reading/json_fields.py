@@ -15,6 +15,17 @@ from visloc.errors import VislocError, refuse
 LARGEST = 1e15  # of any number: what poses and points are made of must not overflow
 _NAMED = 10  # how many fields a note lists
 
+# Whose a file is that has a field at its top, for errors.
+_FILES = {
+    "root_path": "OpenMVG's, which `mapping import openmvg` reads",
+    "frames": "nerfstudio's, which `mapping import nerfstudio` reads",
+    "shots": "OpenSfM's, which `mapping import opensfm` reads",
+    **dict.fromkeys(
+        ("featuresFolders", "matchesFolders"),
+        "Meshroom's: aliceVision_exportColmap makes what `mapping import colmap` reads of it",
+    ),
+}
+
 # By key, those asked for of each object that stood at one place; None for all keys of an object
 # or all elements of an array. Places are told apart by keys, not by indices: one entry serves the
 # frames of a whole recording.
@@ -54,7 +65,15 @@ class JsonValue:
         """Make an error about this value."""
         text = repr(self.value) if isinstance(self.value, bool | int | float | str) else None
         kind = text or ("null" if self.value is None else type(self.value).__name__)
+        message += self._whose()
         return refuse("import.json", message, field=self.where, expected=expected, got=kind)
+
+    def _whose(self) -> str:
+        """Say which program's a file looks like, if this is its top."""
+        top = self.value[0] if isinstance(self.value, list) and self.value else self.value
+        if self.parent is not None or not isinstance(top, dict):
+            return ""
+        return next((f"; the file looks like {of}" for key, of in _FILES.items() if key in top), "")
 
     def __getitem__(self, key: str) -> JsonValue:
         """Return a field of this object.
@@ -64,7 +83,7 @@ class JsonValue:
         """
         found = self.get(key)
         if found is None:
-            raise refuse("import.json", f"{key!r} is missing", field=self.where)
+            raise refuse("import.json", f"{key!r} is missing{self._whose()}", field=self.where)
         return found
 
     def get(self, key: str) -> JsonValue | None:

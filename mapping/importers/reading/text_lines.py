@@ -64,6 +64,11 @@ class TextLines:
             raise refuse("import.truncated", field=f"{self.path}:{self.number}", expected=expected)
         return line
 
+    def end(self, of: str) -> None:
+        """Refuse what comes after the end."""
+        if (line := self.next_or_none()) is not None:
+            raise self.error(f"the file goes on after {of}", expected="its end", got=line[:80])
+
     def next_numbers(self, count: int, expected: str) -> list[float]:
         """Return the next line's fields: exactly ``count`` finite numbers."""
         fields = self.next(expected).split()

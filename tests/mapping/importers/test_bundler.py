@@ -92,7 +92,7 @@ def test_points_project_to_the_measurements_of_an_exact_model(folder: Path) -> N
     assert camera is not None
     assert camera.model == "RADIAL"
     assert camera.params == (500.0, 320.0, 240.0, -0.1, 0.03)
-    assert model.notes == ()
+    assert model.notes == ("3 focal lengths in list.txt are not read",)
 
 
 def test_camera_centres_stay_and_axes_turn(folder: Path) -> None:
