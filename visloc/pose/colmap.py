@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from visloc.geometry import Camera, Pose
 
+_COMES_BACK_PX = 1.0  # far above what undistortion leaves, far below what is seen beyond 90 degrees
+
 
 def colmap_camera(camera: Camera) -> pycolmap.Camera:
     """Return the same camera for pycolmap. Pixel conventions are the same."""
@@ -34,12 +36,16 @@ def pose_from_colmap(rigid: pycolmap.Rigid3d) -> Pose:
 def normalized_rays(camera: Camera, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return the points (N, 3) at depth 1 that pixels (N, 2) see, in the camera's frame.
 
-    A pixel whose undistortion does not converge gives NaN.
+    A pixel whose undistortion does not converge, or that sees what is beside or behind the camera,
+    gives NaN.
     """
     if len(pixels) == 0:
         return np.empty((0, 3))
     plane = np.asarray(_kept_camera(camera).cam_from_img(np.asarray(pixels, dtype=np.float64)))
-    return np.column_stack([plane, np.ones(len(plane))])
+    rays = np.column_stack([plane, np.ones(len(plane))])
+    # pycolmap has points in front of wide cameras for what lies beside them, too.
+    rays[~(np.abs(project(camera, rays) - pixels).max(axis=1) < _COMES_BACK_PX)] = np.nan
+    return rays
 
 
 def project(camera: Camera, points: NDArray[np.float64]) -> NDArray[np.float64]:
