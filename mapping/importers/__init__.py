@@ -126,7 +126,8 @@ def read_model(
 
     Raises:
         InvalidInput: ``import.unknown_format``, ``import.photos``.
-        DatasetError: with the file, and the line or image, that is wrong.
+        DatasetError: ``import.*`` or ``camera.*``, with the file, and the line or image, that is
+            wrong.
     """
     if name not in IMPORTERS:
         raise refuse("import.unknown_format", field="FORMAT", expected=IMPORTERS, got=name)

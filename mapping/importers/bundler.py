@@ -54,11 +54,6 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
             photos is ``NAME.list.txt`` or ``list.txt`` beside the file, or ``list.txt`` in the
             folder above or in ``photos``.
         photos: folder of photos; the list's folder by default.
-
-    Raises:
-        DatasetError: ``import.missing`` (also for the list), ``import.unreadable``,
-            ``import.truncated``, ``import.line`` (malformed, with file and line),
-            ``import.photo_name``, ``import.photo``, ``import.feature_moved``, ``import.no_photos``.
     """
     path = _bundle_file(path)
     list_file = _list_file(path, photos)

@@ -38,11 +38,6 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
             in subfolders of its own, of which the largest is taken; or a database; a folder with
             nothing but a ``database.db`` (or a single ``*.db``) is taken for that.
         photos: folder that names are relative to; None takes ``images`` in or beside ``path``.
-
-    Raises:
-        NotFound: ``import.missing`` if there is neither a model nor a database.
-        DatasetError: ``import.colmap`` for a damaged file, ``camera.model`` for a camera that
-            kapture cannot hold, ``import.duplicate_image``.
     """
     folders = _model_folders(path)
     model, folder, notes = _largest(folders) if folders else (None, None, [])

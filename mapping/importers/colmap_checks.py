@@ -54,10 +54,6 @@ def check_model(folder: Path, copy: Path) -> dict[int, str] | None:
 
     Returns:
         The images' names by id; None for a binary model, which pycolmap can read as it is.
-
-    Raises:
-        DatasetError: ``import.colmap`` with the file, and the line of a text;
-            ``import.duplicate_image`` for two images of one name.
     """
     if _suffix(folder) == ".bin":
         for name in (*FILES, *_OPTIONAL):

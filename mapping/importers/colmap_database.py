@@ -44,11 +44,7 @@ class Database:
 
 
 def read_database(path: Path) -> Database:
-    """Read a database.
-
-    Raises:
-        DatasetError: ``import.unreadable``, ``import.colmap``.
-    """
+    """Read a database."""
     try:
         with path.open("rb") as file:
             is_database = file.read(len(_SQLITE)) == _SQLITE

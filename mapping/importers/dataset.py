@@ -22,7 +22,7 @@ from visloc.kapture import (
     write_local_features,
     write_reconstruction,
 )
-from visloc.kapture.text import is_field, is_folder_name, relative_path
+from visloc.kapture.text import is_folder_name, is_path_field
 
 MASKS = "masks"  # the folder of a dataset for ``mapping build --masks``
 _NAMED = 3  # how many names an error or note lists
@@ -173,11 +173,7 @@ def _check_images(model: ImportedModel) -> None:
 
 
 def _check_path(path: str, image: str) -> None:
-    try:
-        usable = relative_path(path) == path and is_field(path)
-    except ValueError:
-        usable = False
-    if not usable:
+    if not is_path_field(path):
         raise refuse("import.name", field=f"image {image!r}", got=path)
 
 

@@ -70,10 +70,6 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
     Args:
         path: the file, or the folder that holds it.
         photos: folder that ``file_path`` is relative to; None takes that of the file.
-
-    Raises:
-        DatasetError: ``import.missing``, ``import.json``, ``import.photo_name`` or ``camera.*``,
-            with the file and the frame.
     """
     file = path / _FILE if path.is_dir() else path
     top = read_json(file)

@@ -74,12 +74,6 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
     Args:
         path: the file, or a folder with exactly one ``*.nvm``.
         photos: folder of photos; the file's folder by default.
-
-    Raises:
-        DatasetError: ``import.missing``, ``import.unreadable``, ``import.truncated``,
-            ``import.line`` (malformed, with file and line), ``import.photo_name``,
-            ``import.photo``, ``import.feature_moved``, or ``import.no_photos`` if no photo of
-            the model is there.
     """
     path = _nvm_file(path)
     photos = path.parent if photos is None else photos
@@ -104,12 +98,7 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
 
 
 def read_poses(path: Path) -> dict[str, Pose]:
-    """Read ``cam_from_world`` by name from the first model of a file; its points are not read.
-
-    Raises:
-        DatasetError: ``import.unreadable``, ``import.truncated``, ``import.line``; ``import.empty``
-            without a camera; ``import.duplicate_image``.
-    """
+    """Read ``cam_from_world`` by name from the first model of a file; its points are not read."""
     found: dict[str, Pose] = {}
     with TextLines(path) as lines:
         _, has_matrices = _read_header(lines)

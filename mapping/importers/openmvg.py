@@ -51,11 +51,6 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
     Args:
         path: ``sfm_data.json``, or the folder that holds it.
         photos: folder of photos; by default what the file names as ``root_path``, when it exists.
-
-    Raises:
-        DatasetError: ``import.missing``, ``import.unreadable``, ``import.json`` (malformed, with
-            the place in the file), ``import.line`` or ``import.descriptors`` (of feature files),
-            ``import.photo_name``, ``import.feature_moved``, or ``import.empty`` without photos.
     """
     if path.is_dir():
         path = path / "sfm_data.json"

@@ -61,11 +61,6 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
     Args:
         path: the dataset's folder, or its ``reconstruction.json``.
         photos: folder of photos; ``images`` in the dataset by default, when it exists.
-
-    Raises:
-        DatasetError: ``import.missing``, ``import.unreadable``, ``import.json`` (malformed, with
-            the place in the file), ``import.line`` (of ``tracks.csv``), ``import.features``,
-            ``import.photo_name``, ``import.feature_moved``, or ``import.empty`` without photos.
     """
     path = path / "reconstruction.json" if path.is_dir() else path
     folder = path.parent
@@ -314,11 +309,7 @@ def _with_features(
 def _checked_rows(
     path: Path, measurements: Measurements, features: Sequence[Features]
 ) -> NDArray[np.int64]:
-    """Return the observations, once every one of them is known to be a feature.
-
-    Raises:
-        DatasetError: ``import.features``.
-    """
+    """Return the observations, once every one of them is known to be a feature."""
     for rank, found in enumerate(features):
         rows = measurements.image == rank
         numbers, xy = measurements.feature[rows], measurements.xy[rows]

@@ -39,12 +39,7 @@ class Features:
 
 
 def read_features(folder: Path, names: Sequence[str]) -> list[Features] | None:
-    """Read the features of photos, None unless all have a file.
-
-    Raises:
-        DatasetError: ``import.features`` for a file that is malformed, or whose descriptors are
-            of another length or type than those of the others.
-    """
+    """Read the features of photos, None unless all have a file."""
     paths = []
     for name in names:
         files = [Path(f"{folder / name}.{ending}") for ending in ("features.npz", "npz")]

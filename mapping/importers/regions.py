@@ -24,11 +24,7 @@ _DIMENSIONS = 128  # of SIFT; a descriptor is that many bytes
 
 
 def read_keypoints(path: Path) -> NDArray[np.float32]:
-    """Read the features (n, 4) of a photo: x, y, scale, orientation (rad), as in the file.
-
-    Raises:
-        DatasetError: ``import.line``, ``import.missing`` or ``import.unreadable``.
-    """
+    """Read the features (n, 4) of a photo: x, y, scale, orientation (rad), as in the file."""
     rows = []
     with TextLines(path) as lines:
         while (line := lines.next_or_none()) is not None:
@@ -44,11 +40,7 @@ def read_keypoints(path: Path) -> NDArray[np.float32]:
 
 
 def read_descriptors(path: Path, count: int) -> NDArray[np.uint8]:
-    """Read SIFT descriptors (count, 128): a 64-bit count, little-endian, and the bytes.
-
-    Raises:
-        DatasetError: ``import.descriptors`` if it holds anything else, or ``import.unreadable``.
-    """
+    """Read SIFT descriptors (count, 128): a 64-bit count, little-endian, and the bytes."""
     size = 8 + count * _DIMENSIONS
     try:
         with path.open("rb") as file:

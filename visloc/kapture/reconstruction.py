@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from visloc.errors import VislocError, refuse
 from visloc.kapture.feature_reader import FeatureSet, feature_types, open_features
 from visloc.kapture.table import Table
-from visloc.kapture.text import is_field, relative_path
+from visloc.kapture.text import is_field, is_path_field
 from visloc.kapture.writer import VERSION_LINE, write_atomically
 
 _POINTS = "reconstruction/points3d.txt"
@@ -261,17 +261,10 @@ def _check(reconstruction: Reconstruction) -> None:
             f"observations {r.observations.shape} {r.observations.dtype}",
         )
     for text in r.images:
-        if not is_field(text) or _normalized(text) != text:
+        if not is_path_field(text):
             raise _not_a_field(text)
     if r.keypoints_type is not None and not (r.keypoints_type and is_field(r.keypoints_type)):
         raise _not_a_field(r.keypoints_type)
-
-
-def _normalized(text: str) -> str | None:
-    try:
-        return relative_path(text)
-    except ValueError:
-        return None
 
 
 def _not_a_field(text: str) -> VislocError:

@@ -45,6 +45,14 @@ def is_field(text: str) -> bool:
     return text == text.strip() and "," not in text and not has_control_characters(text)
 
 
+def is_path_field(text: str) -> bool:
+    """Tell whether a text can be one field, which reading as the path of a photo returns."""
+    try:
+        return is_field(text) and relative_path(text) == text
+    except ValueError:
+        return False
+
+
 def is_folder_name(text: str) -> bool:
     """Tell whether a text can be the name of a folder, such as a feature type."""
     return is_field(text) and text not in ("", ".", "..") and not set(text) & set("/\\:")

@@ -11,7 +11,7 @@ from visloc.errors import refuse
 from visloc.geometry import Pose
 from visloc.kapture.dataset import Dataset
 from visloc.kapture.other_sensors import OTHER_FILES
-from visloc.kapture.text import is_field, relative_path
+from visloc.kapture.text import is_field, is_path_field
 
 VERSION_LINE = "# kapture format: 1.1"
 
@@ -139,12 +139,6 @@ def _text(name: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> s
 
 
 def _comes_back(field: str, *, is_first: bool, is_path: bool) -> bool:
-    if is_path:
-        try:
-            if relative_path(field) != field:
-                return False
-        except ValueError:
-            return False
     if is_first and field[:1] in ("", "#"):  # reads as nothing, or as a comment
         return False
-    return is_field(field)
+    return is_path_field(field) if is_path else is_field(field)

@@ -21,11 +21,7 @@ _AGREES = 0.01
 
 
 def note_on_absent(path: Path, photos: Path, names: list[str], kept: list[int]) -> list[str]:
-    """Say which photos are absent, and refuse a model without any.
-
-    Raises:
-        DatasetError: ``import.no_photos``.
-    """
+    """Say which photos are absent, and refuse a model without any."""
     absent = sorted(set(range(len(names))) - set(kept))
     if not absent:
         return []

@@ -76,11 +76,7 @@ class JsonValue:
         return next((f"; the file looks like {of}" for key, of in _FILES.items() if key in top), "")
 
     def __getitem__(self, key: str) -> JsonValue:
-        """Return a field of this object.
-
-        Raises:
-            DatasetError: ``import.json`` if there is none.
-        """
+        """Return a field of this object."""
         found = self.get(key)
         if found is None:
             raise refuse("import.json", f"{key!r} is missing{self._whose()}", field=self.where)
@@ -180,11 +176,7 @@ def notes_on_unread(top: JsonValue) -> tuple[str, ...]:
 
 
 def read_json(path: Path) -> JsonValue:
-    """Read a JSON file. Keys that occur twice in an object and NaN are refused.
-
-    Raises:
-        DatasetError: ``import.missing``, ``import.unreadable`` or ``import.json``.
-    """
+    """Read a JSON file. Keys that occur twice in an object and NaN are refused."""
     try:
         value = json.loads(
             path.read_bytes(), parse_constant=_not_finite, object_pairs_hook=_unique_keys

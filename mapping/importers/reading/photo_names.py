@@ -37,10 +37,6 @@ def photo_names(
 
     Returns:
         The names, with forward slashes, and notes.
-
-    Raises:
-        DatasetError: ``import.photo_name`` for a name that is empty, holds a comma or control
-            characters, or is that of another photo.
     """
     folder = _absolute(photos)
     names: list[str] = []
@@ -84,11 +80,7 @@ def _relative(text: str, base: Path, photos: Path, folder: str) -> tuple[str, bo
 
 
 def photo_size(path: Path) -> tuple[int, int] | None:
-    """Return (width, height) from a photo's header, None if there is no such file.
-
-    Raises:
-        DatasetError: ``import.photo`` if it is not a readable image.
-    """
+    """Return (width, height) from a photo's header, None if there is no such file."""
     return _header(path).size if _is_file(path) else None
 
 
@@ -96,19 +88,12 @@ def photo_size_as_read(path: Path) -> tuple[int, int] | None:
     """Return the size in which a build reads a photo, None if there is no such file.
 
     It is smaller than ``photo_size`` for a photo of very many pixels.
-
-    Raises:
-        DatasetError: ``import.photo`` if it is not a readable image.
     """
     return _told(path, lambda: size_as_read(path)) if _is_file(path) else None
 
 
 def is_stored_turned(path: Path) -> bool:
-    """Tell whether EXIF says that width and height swap when the photo is turned upright.
-
-    Raises:
-        DatasetError: ``import.photo`` if it is not a readable image.
-    """
+    """Tell whether EXIF says that width and height swap when the photo is turned upright."""
     return _header(path).exif_orientation in _SWAPPING
 
 

@@ -54,11 +54,7 @@ class TextLines:
                 return text
 
     def next(self, expected: str) -> str:
-        """Return the next line that is not blank, stripped.
-
-        Raises:
-            DatasetError: ``import.truncated`` at the end of the file.
-        """
+        """Return the next line that is not blank, stripped."""
         line = self.next_or_none()
         if line is None:
             raise refuse("import.truncated", field=f"{self.path}:{self.number}", expected=expected)

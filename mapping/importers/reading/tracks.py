@@ -57,9 +57,6 @@ def keypoints_of(
     Returns:
         Per image (n, 2) keypoints, in the order of the feature numbers, and the observations
         (M, 3): point, image, row of the keypoint.
-
-    Raises:
-        DatasetError: ``import.feature_moved`` if one feature has two positions.
     """
     pairs = np.column_stack([measurements.image, measurements.feature])
     unique, first, inverse = np.unique(pairs, axis=0, return_index=True, return_inverse=True)
