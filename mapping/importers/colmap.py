@@ -168,7 +168,7 @@ def _model(
         )
     points, colors, observations = _points(model, rows)
     users = {image.camera_id: image.name for image in colmap_images}
-    sensors = _sensors(model.cameras, users, folder, notes)
+    sensors = _sensors(dict(model.cameras.items()), users, folder, notes)
     gnss = _gnss(known, timestamps)
     return ImportedModel(
         sensors=sensors | _gnss_sensors(gnss),

@@ -234,6 +234,8 @@ def _camera(top: JsonValue, frame: JsonValue, name: str, folder: Path, seen: _Se
     k1, k2, k3, k4, p1, p2 = (number(key) or 0.0 for key in _DISTORTION)
     params: tuple[float, ...]
     if kind == "OPENCV_FISHEYE":
+        if p1 or p2:
+            raise frame.error("kapture cannot store p1 and p2 of a fisheye camera", expected="0")
         ours, params = kind, (*pinhole, k1, k2, k3, k4)
     elif kind not in _PERSPECTIVE:
         raise refuse(
