@@ -13,7 +13,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import PIL.Image  # noqa: F401  before pycolmap
+import PIL.Image
 import pycolmap
 import pytest
 from rich.console import ConsoleDimensions
@@ -387,6 +387,21 @@ def test_an_imported_dataset_is_written_once(run: Run, shared_data: Path, tmp_pa
     assert len(read_dataset(tmp_path / "door").images) == 12
     error = error_of(run("import", "colmap", door, "--output", tmp_path / "door"))
     assert f"error [import.exists] {tmp_path / 'door'}" in error
+
+
+def test_an_import_says_how_to_build_with_all_that_it_read(run: Run, tmp_path: Path) -> None:
+    for name, mode in (("a.jpg", "RGB"), ("d.png", "I;16"), ("m.png", "L")):
+        PIL.Image.new(mode, (64, 48)).save(tmp_path / name)
+    frame = {"file_path": "a.jpg", "depth_file_path": "d.png", "mask_path": "m.png"}
+    frame |= {"transform_matrix": np.eye(4).tolist(), "sharpness": 1.0}
+    top = {"fl_x": 50, "integer_depth_scale": 0.00015, "frames": [frame]}
+    (tmp_path / "transforms.json").write_text(json.dumps(top))
+    status, out, _ = run("import", "nerfstudio", tmp_path, "--output", tmp_path / "out")
+    assert status == 0
+    assert "fields that are not read: frames[].sharpness (1)" in out
+    assert out.splitlines()[-1].endswith(
+        f"--method rgbd --metric --depth-scale 0.00015 --masks {tmp_path / 'out' / 'masks'}"
+    )
 
 
 def test_pairs_are_written_without_a_build_and_once(run: Run, sample: Path, tmp_path: Path) -> None:

@@ -533,3 +533,28 @@ def test_what_is_no_plain_file_is_refused_and_not_waited_for(
         path.mkdir()
     error = refusal(root)
     assert (error.code, error.field) == ("kapture.unreadable", f"sensors/{name}.txt")
+
+
+@pytest.mark.parametrize(
+    ("own", "far"),
+    [
+        ("", None),
+        ("1, cam, 1, 0, 0, 0, 1, 2, 3", None),
+        ("1, cam, 1, 0, 0, 0, 1.00001, 2, 3", None),  # as it is written with few digits
+        ("1, cam, 1, 0, 0, 0, 101, 2, 3", "100 units"),
+        ("1, cam, 0.999, 0.04, 0, 0, 1, 2, 3", "0.289 units"),
+    ],
+)
+def test_poses_of_photos_that_contradict_their_rig_are_named(
+    tmp_path: Path, own: str, far: str | None
+) -> None:
+    sensors = "cam, , camera, PINHOLE, 64, 48, 50, 50, 32, 24"
+    files = {
+        "sensors": sensors,
+        "rigs": "rig, cam, 1, 0, 0, 0, 1, 0, 0",
+        "records_camera": "1, cam, a.jpg",
+        "trajectories": f"1, rig, 1, 0, 0, 0, 0, 2, 3\n{own}\n",
+    }
+    notes = [note for note in read_dataset(write(tmp_path, files)).notes if "rig" in note]
+    assert len(notes) == (far is not None)
+    assert all("a.jpg is" in note and str(far) in note for note in notes)
