@@ -7,6 +7,7 @@ from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from typing import TypeVar
 
+from python_multipart.multipart import parse_options_header
 from starlette.requests import Request
 
 from service.api import jobs
@@ -59,8 +60,9 @@ async def read_localize_job(request: Request) -> RigJob:
         form = parse_form(
             content_type,
             body,
-            FormLimits(len(_FILES), len(LocalizeRequest.model_fields), REQUEST_OVERHEAD_BYTES),
+            FormLimits(len(LocalizeRequest.model_fields), REQUEST_OVERHEAD_BYTES),
             expected="a form with a file image or features, and texts map, camera, options...",
+            text_names=LocalizeRequest.model_fields.keys() - _FILES.keys(),
         )
         _check_kinds(form)
         return jobs.photo_job_of(LocalizeRequest.read({**form.texts, **form.files}))
@@ -139,9 +141,23 @@ def checked_media_type(request: Request, kinds: Collection[str]) -> str:
     """Return the media type of the body.
 
     Raises:
-        InvalidInput: ``request.content_type`` when it is none of ``kinds``.
+        InvalidInput: ``request.content_type`` when it is none of ``kinds``, or JSON in another
+            charset than UTF-8; ``request.content_encoding`` when the body is compressed.
     """
-    media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    encodings = ",".join(request.headers.getlist("content-encoding")).lower()
+    if not {each.strip() for each in encodings.split(",")} <= {"", "identity"}:
+        raise refuse("request.content_encoding", field="Content-Encoding", got=encodings[:100])
+    name, options = parse_options_header(request.headers.get("content-type", ""))
+    media_type = name.decode("latin-1").strip()
+    charset = options.get(b"charset", b"utf-8").decode("latin-1").lower()
+    if media_type.endswith("json") and charset not in ("utf-8", "utf8", "us-ascii"):
+        raise refuse(
+            "request.content_type",
+            "JSON is read in UTF-8 only",
+            field="Content-Type",
+            expected="charset=utf-8, or no charset",
+            got=charset[:100],
+        )
     if media_type not in kinds:
         raise refuse(
             "request.content_type",
@@ -162,8 +178,9 @@ async def _read_batch(request: Request, to_job: ToJob[JobT], *, max_files: int) 
         form = parse_form(
             content_type,
             body,
-            FormLimits(max_files, max_texts=1, max_text_bytes=max_bytes),
+            FormLimits(max_files + 1, max_text_bytes=max_bytes),
             expected=f"a form with a text request (JSON) and at most {max_files} files",
+            text_names=("request",),
         )
         if form.texts.keys() != {"request"}:
             raise _no_request_text(form)
@@ -176,7 +193,7 @@ async def _read_batch(request: Request, to_job: ToJob[JobT], *, max_files: int) 
 
 
 def _no_request_text(form: Form) -> VislocError:
-    name = next(iter(form.texts), None)
+    name = next((name for name in form.texts if name != "request"), None)
     return refuse(
         "request.missing_field" if name is None else "request.unknown_field",
         "the form needs the request as a text part",
@@ -192,7 +209,8 @@ def _check_kinds(form: Form) -> None:
     Raises:
         InvalidInput: ``request.invalid``.
     """
-    for name in form.texts.keys() & _FILES.keys():
+    # Features are JSON, which is text.
+    for name in form.texts.keys() & (_FILES.keys() - {"features"}):
         raise refuse(
             "request.invalid",
             "the form has the wrong kind of part here",

@@ -220,7 +220,7 @@ def parsers() -> dict[str, Callable[[], Parser]]:
     batch, crlf = _SETTINGS.max_batch_bytes, b"\r\n"
     most = max_sequence_values(_SETTINGS)
     form = b'--b\r\nContent-Disposition: form-data; name="image"; filename="a"\r\n\r\n'
-    form_limits = FormLimits(32_000, 1, batch)
+    form_limits = FormLimits(32_001, batch)
     chunked = b"POST / HTTP/1.1\r\nHost: a\r\nTransfer-Encoding: chunked\r\n\r\n"
     return {
         **{f"photo: {kind}": lambda kind=kind: _photos(kind) for kind in _KINDS},
