@@ -7,7 +7,6 @@ absent, the version is told by the shape of ``sensorReadings``. Writing is stric
 from __future__ import annotations
 
 import math
-from codecs import BOM_UTF8
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal, Self
 
@@ -22,7 +21,7 @@ from visloc.geometry import Camera, Pose
 from visloc.options import LocalizeOptions
 from visloc.types import MAX_RADIUS_M, Near, RigSensor
 from visloc_api.words.geopose import GeoPose
-from visloc_api.words.json_text import check_json_values, check_names
+from visloc_api.words.json_text import check_json_values, check_names, utf8_json
 from visloc_api.words.message import MAX_INSTANT_VALUES, refusal_of
 
 # A device is searched for so far around a position at least: cities make fixes worse than they say.
@@ -145,10 +144,10 @@ class GeoPoseRequest(_Read):
                 ``request.duplicate_field``.
             TooLarge: ``request.too_large``.
         """
+        text = utf8_json(text)
         check_json_values(text, MAX_INSTANT_VALUES)
         try:
-            # Some writers begin with a byte order mark, which readers may ignore (RFC 8259).
-            body = from_json(text.removeprefix(BOM_UTF8), allow_inf_nan=False)
+            body = from_json(text, allow_inf_nan=False)
         except ValueError:
             raise refuse("request.malformed", expected="JSON") from None
         check_names(text)

@@ -12,7 +12,6 @@ from visloc_api.words.json_text import bytes_of_base64
 
 # JPEG, PNG, TIFF; RIFF is followed by the name WEBP. Two letters of BMP say too little.
 _FILE_BEGINNINGS = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"II*\0", b"MM\0*", b"RIFF")
-_FROM_URL_SAFE = str.maketrans("-_", "+/", " \t\r\n=")
 _GREY, _RGB = 0, 2  # colour types of PNG
 
 
@@ -25,8 +24,7 @@ def image_bytes(
     RGBA32: a file is known by its first bytes, bare pixels by their number.
 
     Args:
-        text: base64, also of the alphabet for URLs, with line breaks, without padding, or as a
-            data URL.
+        text: base64, as ``bytes_of_base64`` reads it.
         image_format: what the reading says.
         size: width and height, for bare pixels.
         max_bytes: largest photo.
@@ -35,8 +33,6 @@ def image_bytes(
         InvalidInput: ``image.base64``, ``image.empty``, ``image.format``.
         TooLarge: ``image.too_large``.
     """
-    if text[:5].lower() == "data:":
-        text = text.partition(",")[2]
     # Before it is decoded: four letters make three bytes, and one in 76 may be a line break.
     if len(text) * 3 // 4 > max_bytes * 78 // 76 + 4:
         raise refuse(
@@ -45,9 +41,8 @@ def image_bytes(
             expected=f"at most {max_bytes}",
             got=f"about {len(text) * 3 // 4}",
         )
-    text = text.translate(_FROM_URL_SAFE)
     try:
-        data = bytes_of_base64(text + "=" * (-len(text) % 4))
+        data = bytes_of_base64(text)
     except ValueError as error:
         raise refuse(
             "image.base64", field="imageBytes", expected="the photo in base64", got=str(error)

@@ -34,7 +34,7 @@ def _bytes_from_base64(value: object, field: str) -> object:
         raise refuse(
             "image.base64",
             field=field,
-            expected="the encoded photo in standard base64",
+            expected="the encoded photo in base64",
             got=str(error),
         ) from None
 
@@ -55,7 +55,7 @@ def _array_bytes_from_base64(value: object) -> object:
     try:
         return bytes_of_base64(value)
     except ValueError:
-        raise PydanticCustomError("base64", "the array's bytes in standard base64") from None
+        raise PydanticCustomError("base64", "the array's bytes in base64") from None
 
 
 class Array(IncomingMessage):

@@ -7,8 +7,8 @@ it base64. What is done here takes milliseconds at a time.
 from __future__ import annotations
 
 import base64
-import binascii
 import json
+from codecs import BOM_UTF8
 from collections.abc import Iterable, Sequence
 from typing import AnyStr
 
@@ -19,6 +19,9 @@ MAX_NAME = 100  # characters of a name from outside that a refusal repeats
 _PIECE = 2**20
 # Texts of at least so many characters are replaced before names are compared.
 _LONG = 1000
+# Characters before the data of a data URL.
+_LONGEST_MEDIA_TYPE = 200
+_FROM_URL_SAFE = bytes.maketrans(b"-_", b"+/")
 
 
 def check_json_values(text: str | bytes, max_values: int, field: str = "") -> None:
@@ -85,18 +88,46 @@ def check_names_once(fields: list[tuple[str, object]]) -> None:
         seen.add(name)
 
 
+def utf8_json(text: AnyStr) -> AnyStr:
+    """Return JSON without the byte order mark with which some writers begin (RFC 8259, 8.1).
+
+    Raises:
+        InvalidInput: ``request.malformed`` for UTF-16 and UTF-32.
+    """
+    if isinstance(text, str):
+        return text.removeprefix("\ufeff")
+    if b"\0" in text[:4]:
+        raise refuse("request.malformed", expected="JSON in UTF-8", got="UTF-16 or UTF-32")
+    return text.removeprefix(BOM_UTF8)
+
+
 def bytes_of_base64(text: str) -> bytes:
-    """Decode standard base64, padded and without anything else in it.
+    """Decode base64 as clients write it.
+
+    It may have line ends or no padding, be of the alphabet for URLs, or be a data URL. A blank is
+    an error: decoders of forms put it in the place of a plus sign.
 
     Raises:
         ValueError: when it is none; ``binascii.Error`` is one.
     """
-    parts = []
-    for start in range(0, len(text), _PIECE):
-        piece = text[start : start + _PIECE]
-        if start + _PIECE < len(text) and piece.endswith("="):
-            raise binascii.Error("Excess data after padding")
-        parts.append(base64.b64decode(piece, validate=True))
+    text, start = text.strip(), 0
+    if text[:5].lower() == "data:":
+        start = text.find(",", 0, _LONGEST_MEDIA_TYPE) + 1
+        if not text[:start].lower().endswith(";base64,"):
+            raise ValueError("a data URL that is not in base64")
+    parts, rest = [], b""
+    for place in range(start, len(text), _PIECE):
+        piece = text[place : place + _PIECE].encode("ascii")
+        if b" " in piece:
+            raise ValueError("a blank, perhaps in the place of a plus sign")
+        piece = rest + piece.translate(_FROM_URL_SAFE, b"\r\n")
+        # The last letters wait: the next piece may hold their padding, or no more than line ends.
+        end = max(0, len(piece) - 1) // 4 * 4
+        if piece[end - 1 : end] == b"=":
+            raise ValueError("data after the padding")
+        parts.append(base64.b64decode(piece[:end], validate=True))
+        rest = piece[end:]
+    parts.append(base64.b64decode(rest + b"=" * (-len(rest) % 4), validate=True))
     return b"".join(parts)
 
 

@@ -19,7 +19,7 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from visloc.errors import InvalidInput, VislocError, placed, refuse
-from visloc_api.words.json_text import MAX_NAME, check_json_values, check_names
+from visloc_api.words.json_text import MAX_NAME, check_json_values, check_names, utf8_json
 
 T = TypeVar("T")
 
@@ -50,7 +50,10 @@ else:
 
 
 class IncomingMessage(_Made):
-    """A request, or a part of one. Unknown fields are refused by name."""
+    """A request, or a part of one. Unknown fields are refused by name.
+
+    null is as if a field that may be left out were: clients that write all fields write it.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, defer_build=True)
     # Where this message sits in the request, for errors of what is read on its own.
@@ -68,7 +71,12 @@ class IncomingMessage(_Made):
                 raise PydanticCustomError(
                     _UNKNOWN_FIELD, "unknown field", {"name": str(name), "expected": expected}
                 )
-        return value
+        fields = cls.model_fields
+        return {
+            name: each
+            for name, each in value.items()
+            if each is not None or fields[name].is_required()
+        }
 
     @classmethod
     def read(cls, value: object, limits: object = None) -> Self:
@@ -100,6 +108,7 @@ class IncomingMessage(_Made):
             InvalidInput: as ``read``, ``request.malformed``, ``request.duplicate_field``.
             TooLarge: ``request.too_large``.
         """
+        text = utf8_json(text)
         check_json_values(text, max_values, cls.path.rstrip("."))
         checked = cls._checked(lambda: cls.model_validate_json(text, context=limits))
         check_names(text)  # pydantic takes the last one

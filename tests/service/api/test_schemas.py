@@ -83,8 +83,9 @@ def test_a_full_request_becomes_the_job_that_it_says() -> None:
 
 
 def test_what_is_left_out_or_null_takes_the_default() -> None:
-    for message in (request(), request(camera=None, options={"top_k": None})):
-        job = jobs.photo_job_of(LocalizeRequest.read_json(json.dumps(message)))
+    nulls = {name: None for name in LocalizeRequest.model_fields if name not in request()}
+    for more in ({}, nulls, {"options": {"top_k": None}}):
+        job = jobs.photo_job_of(LocalizeRequest.read_json(json.dumps({**request(), **more})))
         assert job.images[0].camera is None
         assert job.options == CoreOptions()
 
@@ -128,8 +129,8 @@ def test_options_may_be_text() -> None:
             "one of model, width, height, params",
         ),
         (request(map=1), "request.invalid", "map", "Input should be a valid string"),
-        (request(image="?"), "image.base64", "image", "the encoded photo in standard base64"),
-        (request(image="é"), "image.base64", "image", "the encoded photo in standard base64"),
+        (request(image="?"), "image.base64", "image", "the encoded photo in base64"),
+        (request(image="é"), "image.base64", "image", "the encoded photo in base64"),
         (request(image=5), "request.invalid", "image", "Input should be a valid bytes"),
         (request(options=3), "request.invalid", "options", None),
         (request(options={"top_k": "5"}), "request.invalid", "options.top_k", None),
@@ -230,7 +231,8 @@ def test_a_wrong_request_is_refused_by_code_field_and_expectation(
 
 
 @pytest.mark.parametrize(
-    "text", ["", "{", '{"map": }', "\ufeff{}", '{"a": ' * 10_000, '{"map": "\\ud800"}', "NaN,"]
+    "text",
+    ["", "{", '{"map": }', "\ufeff\ufeff{}", '{"a": ' * 10_000, '{"map": "\\ud800"}', "NaN,"],
 )
 def test_malformed_json_is_refused(text: str) -> None:
     with pytest.raises(InvalidInput) as caught:

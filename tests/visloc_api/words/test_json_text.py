@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import base64
 import json
+from collections.abc import Callable
 
 import pytest
 from hypothesis import given
@@ -9,7 +10,7 @@ from hypothesis import strategies as st
 
 from visloc.errors import InvalidInput, TooLarge
 from visloc_api.words import json_text
-from visloc_api.words.json_text import bytes_of_base64, check_json_values, check_names
+from visloc_api.words.json_text import bytes_of_base64, check_json_values, check_names, utf8_json
 
 LONG = "A" * 5000
 texts = st.text() | st.text(alphabet='ab",:\\{}', min_size=1000, max_size=1100)
@@ -69,8 +70,38 @@ def test_base64_is_decoded_in_pieces_as_if_at_once(data: bytes) -> None:
 
 
 @pytest.mark.parametrize(
+    "spell",
+    [
+        lambda text: "\n".join(text[i : i + 76] for i in range(0, len(text), 76)) + "\n",
+        lambda text: "\r\n".join(text[i : i + 64] for i in range(0, len(text), 64)),
+        lambda text: "\r\n".join(text) + "\r\n" * 9,
+        lambda text: text.replace("+", "-").replace("/", "_").rstrip("="),
+        lambda text: f"data:image/jpeg;base64,{text}",
+        lambda text: f"DATA:;charset=utf-8;BASE64,{text}\n",
+        lambda text: f" \t{text} ",
+    ],
+)
+@given(data=st.binary(max_size=200))
+def test_base64_is_read_in_every_spelling(spell: Callable[[str], str], data: bytes) -> None:
+    for piece in (8, 2**20):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(json_text, "_PIECE", piece)
+            assert bytes_of_base64(spell(base64.b64encode(data).decode())) == data
+
+
+@pytest.mark.parametrize(
     "text",
-    ["AAAAAAA=AAAA", "AAAAAA==AAAAAAAA", "AAAAAAAAA", "AAAA AAAAAAA", "\u00e4AAAAAAAAAAA", "="],
+    [
+        *(
+            "AAAAAAA=AAAA",
+            "AAAAAA==AAAAAAAA",
+            "AAAAAAAAA",
+            "AAAA AAAAAAA",
+            "\u00e4AAAAAAAAAAA",
+            "=",
+        ),
+        *("data:image/svg+xml,<svg/>", "data:AAAA", "data:text/plain,a;base64,AAAA", "%2BAAA"),
+    ],
 )
 def test_what_is_no_base64_is_none_in_pieces_either(
     text: str, monkeypatch: pytest.MonkeyPatch
@@ -80,3 +111,16 @@ def test_what_is_no_base64_is_none_in_pieces_either(
     monkeypatch.setattr(json_text, "_PIECE", 8)
     with pytest.raises(ValueError):  # noqa: PT011
         bytes_of_base64(text)
+
+
+@pytest.mark.parametrize("text", ["{}", '{"a": "\u00e4"}', ""])
+def test_byte_order_mark_is_passed_over(text: str) -> None:
+    assert utf8_json(text.encode("utf-8-sig")) == utf8_json(text.encode()) == text.encode()
+    assert utf8_json("\ufeff" + text) == text
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be", "utf-32", "utf-32-be"])
+def test_json_of_another_encoding_is_refused_by_name(encoding: str) -> None:
+    with pytest.raises(InvalidInput) as caught:
+        utf8_json('{"map": "room"}'.encode(encoding))
+    assert (caught.value.code, caught.value.expected) == ("request.malformed", "JSON in UTF-8")
