@@ -35,12 +35,13 @@ def add_access(app: Starlette, access: Access, observer: Observer, *, page: bool
         app.add_middleware(
             CORSMiddleware,
             allow_origins=sorted(access.origins),
-            allow_methods=["GET", "POST", "PUT", "DELETE"],
+            allow_methods=["GET", "HEAD", "POST", "PUT", "DELETE"],
             allow_headers=[
                 *("Authorization", "X-API-Key", "X-Request-ID", TIMEOUT_HEADER, MAP_HEADER),
                 "traceparent",
             ],
             expose_headers=["Location", "Retry-After", "X-Request-ID"],
+            allow_private_network=True,  # Starlette would refuse preflights that ask for it
         )
 
 

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from http import HTTPStatus
 
-from fastapi import Request, Response
+from fastapi import Depends, Request, Response
 from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
+from starlette.types import ASGIApp, Receive, Scope, Send
 
 import visloc
 from service.http.access import add_access
 from service.http.backend import Backend, backend_of
-from service.http.envelope import RequestEnvelope
+from service.http.envelope import PROBED_PATHS, RequestEnvelope
 from service.http.health import add_health_routes
 from service.http.localize import add_localize_routes
 from service.http.maps import add_map_routes
@@ -21,6 +22,7 @@ from service.http.responses import problem_response
 from service.http.scenes import add_scene_routes
 from service.http.static_page import add_page_routes
 from visloc.errors import InvalidInput, NotFound, VislocError, refuse
+from visloc_api.words.json_text import MAX_NAME
 from visloc_api.words.message import refusal_of
 
 
@@ -33,9 +35,11 @@ def create_app(backend: Backend) -> App:
         docs_url=None,  # loads scripts from another host; ours are in static_page
         redoc_url=None,
         redirect_slashes=False,  # the target would be built from the caller's Host header
+        dependencies=[Depends(_check_query)],
     )
     app.state.backend = backend
     settings = backend.settings
+    app.add_middleware(HeadAsGet)
     add_access(app, backend.access, backend.observer, page=settings.page)
     app.add_middleware(RequestEnvelope, backend=backend)
     app.add_exception_handler(VislocError, _on_error)
@@ -49,6 +53,44 @@ def create_app(backend: Backend) -> App:
     if settings.page:
         add_page_routes(app)
     return app
+
+
+class HeadAsGet:
+    """Serves HEAD as GET. uvicorn sends no body."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http" or scope["method"] != "HEAD":
+            await self._app(scope, receive, send)
+            return
+        as_get = {**scope, "method": "GET"}  # uvicorn looks at the original
+        try:
+            await self._app(as_get, receive, send)
+        finally:
+            scope["route"] = as_get.get("route")  # for the log
+
+
+async def _check_query(request: Request) -> None:
+    """Refuse query parameters that would be ignored. Pages and probes may have any."""
+    route = request.scope["route"]
+    if not route.include_in_schema or route.path in PROBED_PATHS:
+        return
+    known = [field.alias for field in route.dependant.query_params]
+    seen: set[str] = set()
+    for name, _ in request.query_params.multi_items():
+        if name not in known:
+            raise refuse(
+                "request.unknown_field",
+                "this path does not have this query parameter",
+                field=name[:MAX_NAME],
+                expected=known or "no query string: fields of a request are in its body",
+                got=name,
+            )
+        if name in seen:
+            raise refuse("request.duplicate_field", field=name)
+        seen.add(name)
 
 
 def _refused(request: Request, error: VislocError, status: HTTPStatus | None = None) -> Response:

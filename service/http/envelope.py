@@ -22,7 +22,7 @@ from visloc.errors import VislocError, refuse
 logger = logging.getLogger(__name__)
 
 # Routes that are answered even when all connections are in use.
-_PROBED_PATHS = ("/healthz", "/readyz", "/metrics")
+PROBED_PATHS = ("/healthz", "/readyz", "/metrics")
 _METHODS = ("GET", "HEAD", "POST", "PUT", "DELETE", "OPTIONS", "PATCH")
 
 
@@ -81,7 +81,7 @@ class RequestEnvelope:
             if "content-length" in headers and "transfer-encoding" in headers:
                 # RFC 9112, 6.3: a proxy may have read the request differently.
                 await refuse(_ambiguous(), HTTPStatus.BAD_REQUEST)
-            elif self._connections.is_busy and scope["path"] not in _PROBED_PATHS:
+            elif self._connections.is_busy and scope["path"] not in PROBED_PATHS:
                 await refuse(_busy())
             else:
                 await self._app(scope, receive, send)

@@ -44,7 +44,13 @@ _SCOPES_OF_CALLS = {
 
 _PAGES = frozenset({"/", "/docs", "/redoc"})
 _ASSET = re.compile(r"/assets/[^/]+")
-_ORIGIN = re.compile(r"https?://[A-Za-z0-9.-]+(:\d{1,5})?|https?://\[[0-9a-f:]+\](:\d{1,5})?")
+# Apps in a web view have schemes of their own, such as capacitor, ionic or tauri.
+_ORIGIN = re.compile(r"([a-z][a-z0-9+.-]*)://([a-z0-9._-]+|\[[0-9a-f:]+\])(?::(\d{1,5}))?/?")
+_DEFAULT_PORTS = {"http": "80", "https": "443"}
+_LARGEST_PORT = 65_535
+_NEVER_A_PAGE = ("file", "ftp", "ws", "wss")
+# Browsers send null for files and for sandboxed frames, which every web page can contain.
+_OF_EVERY_PAGE = ("*", "null")
 
 
 def needed_over_http(method: str, path: str, *, page: bool = False) -> Needed:
@@ -120,7 +126,8 @@ class Access:
 
     Args:
         ring: the keys; without keys, everyone on this machine may do everything.
-        origins: of the web pages that may call; ``*`` for all, only with keys.
+        origins: of the web pages that may call, as browsers send them; ``*`` for all. ``*`` and
+            ``null`` only with keys.
         proxies: tell in ``X-Forwarded-For`` whom they forward.
         now: a clock, seconds.
     """
@@ -251,14 +258,7 @@ def open_access(settings: ServiceSettings) -> Access:
         SettingsError: naming the setting.
     """
     for origin in settings.cors_origins:
-        if origin == "*" and settings.keys_file is None:
-            raise SettingsError(
-                "cors_origins: * lets every web page call the service, so that keys_file is needed"
-            )
-        if origin != "*" and not _ORIGIN.fullmatch(origin):
-            raise SettingsError(
-                f"cors_origins: {origin!r} is no origin such as https://maps.example.org"
-            )
+        _check_origin(origin, has_keys=settings.keys_file is not None)
     proxies = networks_of(settings.trusted_proxies)
     if settings.keys_file is not None:
         try:
@@ -272,6 +272,30 @@ def open_access(settings: ServiceSettings) -> Access:
             "`python -m service.keys init`, or listen on 127.0.0.1 only"
         )
     return Access(None, settings.cors_origins, proxies=proxies)
+
+
+def _check_origin(origin: str, *, has_keys: bool) -> None:
+    """Refuse an origin that no browser sends, or that needs keys."""
+    if origin in _OF_EVERY_PAGE:
+        if not has_keys:
+            raise SettingsError(
+                f"cors_origins: {origin} lets every web page call the service, so that keys_file "
+                "is needed"
+            )
+        return
+    found = _ORIGIN.fullmatch(origin.lower())
+    if found is None or found[1] in _NEVER_A_PAGE or int(found[3] or 0) > _LARGEST_PORT:
+        raise SettingsError(
+            f"cors_origins: {origin!r} is no origin such as https://maps.example.org, "
+            "http://localhost:5173 or capacitor://localhost; name each one with its port, without "
+            "a path and without * (null for pages that are files)"
+        )
+    scheme, host, port = found.groups()
+    sent = f"{scheme}://{host}"
+    if port is not None and port != _DEFAULT_PORTS.get(scheme):
+        sent += f":{port}"
+    if origin != sent:
+        raise SettingsError(f"cors_origins: {origin!r} is sent by browsers as {sent}; write that")
 
 
 def is_loopback(host: str) -> bool:

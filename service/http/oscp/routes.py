@@ -37,7 +37,7 @@ _MAX_ID = 200
 
 def add_geopose_routes(app: FastAPI) -> None:
     """Add ``/geopose``."""
-    app.get("/geopose", response_model=GeoPoseStatus)(geopose_status)
+    app.get("/geopose", response_model=GeoPoseStatus, responses=problems(422))(geopose_status)
     app.post(
         "/geopose",
         response_model=GeoPoseResponse,

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 import threading
 import time
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
@@ -172,10 +173,53 @@ def test_keys_that_cannot_be_read_keep_the_server_from_starting(tmp_path: Path) 
         open_access(ServiceSettings(keys_file=tmp_path / "none.json"))
 
 
-@pytest.mark.parametrize("origin", ["maps.example.org", "https://a/b", "ftp://a", "null", "*"])
-def test_an_origin_that_is_none_or_all_without_keys_is_refused(origin: str) -> None:
-    with pytest.raises(SettingsError, match=r"^cors_origins: "):
-        open_access(ServiceSettings(cors_origins=(origin,)))
+@pytest.mark.parametrize(
+    ("origin", "says"),
+    [
+        ("null", "keys_file is needed"),
+        ("*", "keys_file is needed"),
+        ("maps.example.org", "is no origin"),
+        ("localhost:5173", "is no origin"),
+        ("https://a/b", "is no origin"),
+        ("ftp://a", "is no origin"),
+        ("ws://a:8000", "is no origin"),
+        ("file:///index.html", "is no origin"),
+        ("http://localhost:*", "is no origin"),
+        ("https://*.example.org", "is no origin"),
+        ("http://localhost:65536", "is no origin"),
+        ("https://user@a.example", "is no origin"),
+        ("https://b\u00fccher.example", "is no origin"),
+        ("https://Maps.Example.org", "as https://maps.example.org;"),
+        ("https://maps.example.org/", "as https://maps.example.org;"),
+        ("https://maps.example.org:443", "as https://maps.example.org;"),
+        ("HTTP://localhost:80/", "as http://localhost;"),
+        ("capacitor://localhost/", "as capacitor://localhost;"),
+    ],
+)
+def test_origin_that_no_browser_sends_or_that_needs_keys_is_refused(origin: str, says: str) -> None:
+    with pytest.raises(SettingsError, match=rf"^cors_origins: .*{re.escape(says)}"):
+        open_access(ServiceSettings(cors_origins=("https://a.example", origin)))
+
+
+ORIGINS = [
+    *("https://maps.example.org", "http://localhost:5173", "http://[::1]:8080"),
+    *("capacitor://localhost", "ionic://localhost", "tauri://localhost", "http://tauri.localhost"),
+    *("app://-", "chrome-extension://abcdefghijklmnop", "http://127.0.0.1:65535"),
+]
+
+
+@pytest.mark.parametrize("origin", ORIGINS)
+def test_origins_of_pages_and_apps_may_be_named(origin: str) -> None:
+    access = open_access(ServiceSettings(cors_origins=(origin,)))
+    access.check_page("http", "localhost:8000", [origin])
+
+
+@pytest.mark.parametrize("origin", ["null", "*"])
+def test_every_page_may_call_only_with_keys(origin: str, keys: Keys) -> None:
+    settings = ServiceSettings(cors_origins=(origin,), keys_file=keys.path)
+    answer = http_door(open_access(settings)).ask("GET", "/maps", {"Origin": "null"})
+    assert code_of(answer) == (401, "access.key_missing")
+    assert answer.headers["access-control-allow-origin"] == origin
 
 
 @pytest.mark.parametrize("name", ["localhost.", "127.0.0.1.evil.org", "evil", "0.0.0.0", "[", ""])
@@ -441,6 +485,8 @@ def test_no_page_may_call_unless_its_origin_is_named(keys: Keys) -> None:
     door = http_door(Access(KeyRing(keys.path), ["https://maps.example.org"]))
     opened = door.ask("OPTIONS", "/localize", preflight)
     refused = door.ask("OPTIONS", "/localize", preflight | {"Origin": "https://evil.example"})
+    private = preflight | {"Access-Control-Request-Private-Network": "true"}
+    in_private_network = door.ask("OPTIONS", "/localize", private)
     answer = door.ask("POST", "/localize", {"Origin": "https://maps.example.org"})
 
     assert closed.status_code == 401
@@ -449,6 +495,8 @@ def test_no_page_may_call_unless_its_origin_is_named(keys: Keys) -> None:
     assert opened.headers["access-control-allow-origin"] == "https://maps.example.org"
     assert refused.status_code == 400
     assert "access-control-allow-origin" not in refused.headers
+    assert in_private_network.status_code == 200
+    assert in_private_network.headers["access-control-allow-private-network"] == "true"
     # A preflight lets nobody in: the request itself needs its key, and the page may see why not.
     assert code_of(answer) == (401, "access.key_missing")
     assert answer.headers["access-control-allow-origin"] == "https://maps.example.org"
