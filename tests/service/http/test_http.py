@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import asyncio
 import base64
+import gzip
 import io
 import json
 import logging
@@ -346,8 +347,9 @@ def test_a_form_that_is_not_one_is_refused(doors: Any) -> None:
     refused("request.malformed", content=b"{", headers={"Content-Type": "application/json"})
     refused("request.map", files={"image": photo})
     refused("request.duplicate_field", files=[("image", photo), ("image", photo)])
-    refused("request.malformed", files=[("image", photo)] * 4)
-    refused("request.malformed", data={"map": "x" * 100_000}, files={"image": photo})
+    refused("request.malformed", files=[(f"image{number}", photo) for number in range(20)])
+    long = refused("request.malformed", data={"map": "x" * 100_000}, files={"image": photo})
+    assert long["field"] == "map"
     twice = refused("request.duplicate_field", data={"map": ["a", "b"]}, files={"image": photo})
     assert twice["field"] == "map"
     text = refused("request.invalid", data={"map": "room", "image": "x"}, files={"a": ("", b"")})
@@ -355,6 +357,69 @@ def test_a_form_that_is_not_one_is_refused(doors: Any) -> None:
         "image",
         "a file, as of curl -F image=@photo.jpg",
     )
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "code", "field"),
+    [
+        ("POST", "/localize?camera=PINHOLE,1,1,1,1,1,1", "request.unknown_field", "camera"),
+        ("POST", "/localize?debug=true&top_k=2", "request.unknown_field", "debug"),
+        ("POST", "/localize/rig?ypr", "request.unknown_field", "ypr"),
+        ("POST", "/geopose?map=room", "request.unknown_field", "map"),
+        ("PUT", "/maps/room/versions/2?current=true", "request.unknown_field", "current"),
+        ("GET", "/maps?nera=1,2,3", "request.unknown_field", "nera"),
+        ("GET", "/maps?near=1,2,3&near=4,5,6", "request.duplicate_field", "near"),
+        ("GET", "/maps/room/images?first=0&last=9", "request.unknown_field", "last"),
+    ],
+)
+def test_query_parameter_that_would_be_ignored_is_refused(
+    method: str, path: str, code: str, field: str, doors: Any, query: Any
+) -> None:
+    files = {"image": query.image} if method == "POST" else None
+    response = doors.http.request(method, path, data={"map": "room"}, files=files)
+    assert problem(response, 422, code)["field"] == field
+
+
+@pytest.mark.parametrize("path", ["/healthz?t=123", "/readyz?verbose", "/metrics?a=1"])
+def test_probes_may_have_any_query(path: str, doors: Any) -> None:
+    assert doors.http.get(path).status_code == 200
+
+
+@pytest.mark.parametrize("path", ["/healthz", "/readyz", "/maps", "/maps/room", "/openapi.json"])
+def test_head_has_the_headers_of_get_and_no_body(path: str, doors: Any) -> None:
+    head, get = doors.http.head(path), doors.http.get(path)
+    assert (head.status_code, head.content) == (200, b"")
+    for name in ("content-type", "content-length"):
+        assert head.headers[name] == get.headers[name]
+    assert doors.http.head("/localize").status_code == 405
+
+
+@pytest.mark.parametrize(
+    ("headers", "code", "field"),
+    [
+        ({"Content-Encoding": "gzip"}, "request.content_encoding", "Content-Encoding"),
+        ({"Content-Encoding": "identity, br"}, "request.content_encoding", "Content-Encoding"),
+        ({"Content-Type": "application/json; charset=utf-16"}, "request.content_type", None),
+        ({"Content-Type": "application/json; charset=latin1"}, "request.content_type", None),
+    ],
+)
+@pytest.mark.parametrize("path", ["/localize", "/localize/rig", "/geopose", "/maps/room/current"])
+def test_encodings_that_are_not_read_are_named(
+    path: str, headers: dict[str, str], code: str, field: str | None, doors: Any
+) -> None:
+    headers = {"Content-Type": "application/json"} | headers
+    response = doors.http.post(path, content=gzip.compress(b"{}"), headers=headers)
+    assert problem(response, 422, code)["field"] == (field or "Content-Type")
+
+
+@pytest.mark.parametrize("text", ["{}", "\ufeff{}"])
+@pytest.mark.parametrize(
+    "kind", ["application/json; charset=UTF-8", 'application/json;charset="utf8"']
+)
+def test_json_in_utf_8_is_read_however_it_is_marked(kind: str, text: str, doors: Any) -> None:
+    headers = {"Content-Type": kind, "Content-Encoding": "identity"}
+    response = doors.http.post("/localize", content=text.encode(), headers=headers)
+    problem(response, 422, "request.map")
 
 
 def test_an_unknown_path_or_method_is_a_problem_too(doors: Any) -> None:
