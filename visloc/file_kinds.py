@@ -62,13 +62,18 @@ _RAW = _photos("raw", "develop them to JPEG, such as with: darktable-cli PHOTO P
 _JPEG_XL = _photos("JPEG XL", "convert them to JPEG, such as with: djxl PHOTO PHOTO.jpg")
 _TIFF = _photos("TIFF")
 _SVG = FileKind("SVG", "SVG drawings", "save them as PNG")
-_MP4, _MOV = _video("MP4"), _video("MOV")
+_BIG_TIFF = _photos("BigTIFF", "save them as ordinary TIFF or PNG")
+_MP4, _MOV, _3GP = _video("MP4"), _video("MOV"), _video("3GP")
 
 _SIGNATURES: tuple[tuple[bytes, FileKind], ...] = (
     (b"\xff\xd8\xff", _photos("JPEG")),
     (b"\x89PNG\r\n\x1a\n", _photos("PNG")),
     (b"II*\0", _TIFF),
     (b"MM\0*", _TIFF),
+    (b"II+\0", _BIG_TIFF),
+    (b"MM\0+", _BIG_TIFF),
+    (b"II\xbc\x01", _photos("JPEG XR", "save them as PNG")),
+    (b"v/1\x01", FileKind("OpenEXR", "OpenEXR pictures", "save them as PNG")),
     (b"BM", _photos("BMP")),
     (b"GIF8", FileKind("GIF", "GIF pictures", "save them as PNG")),
     (b"\xff\x0a", _JPEG_XL),
@@ -93,7 +98,9 @@ _BRANDS: tuple[tuple[tuple[bytes, ...], FileKind], ...] = (
     ((b"crx ",), _RAW),  # Canon CR3
     ((b"qt  ",), _MOV),
     ((b"isom", b"iso2", b"iso4", b"iso5", b"iso6", b"mp41", b"mp42", b"avc1"), _MP4),
+    ((b"M4V ", b"M4VH", b"M4VP", b"MSNV", b"f4v ", b"iso3", b"mmp4"), _MP4),
 )
+_3GP_BRANDS = (b"3gp", b"3g2", b"3ge", b"3gs")  # and a digit or letter
 # A QuickTime file without a brand begins with one of these boxes.
 _MOV_BOXES = (b"moov", b"mdat", b"wide", b"pnot")
 _DNG_VERSION, _NEW_SUBFILE_TYPE = 50706, 254  # tags of TIFF
@@ -119,7 +126,10 @@ def _of_brands(head: bytes) -> FileKind | None:
     end = int.from_bytes(head[:4])
     compatible = head[16:end]
     brands = {head[8:12], *(compatible[at : at + 4] for at in range(0, len(compatible), 4))}
-    return next((kind for names, kind in _BRANDS if brands & set(names)), None)
+    found = next((kind for names, kind in _BRANDS if brands & set(names)), None)
+    if found is None and any(brand.startswith(_3GP_BRANDS) for brand in brands):
+        return _3GP
+    return found
 
 
 def _is_raw(head: bytes) -> bool:

@@ -27,9 +27,9 @@ from visloc.errors import VislocError, refuse
 from visloc.file_kinds import HEAD_BYTES, file_kind
 from visloc.images import ImageLimits
 
-SUFFIXES = (".mp4", ".m4v", ".mov", ".webm", ".mkv")
+SUFFIXES = (".mp4", ".m4v", ".mov", ".webm", ".mkv", ".3gp", ".3g2")
 # Demuxers by kind of file (visloc.file_kinds).
-_DEMUXERS = {"MP4": "mov", "MOV": "mov", "Matroska or WebM": "matroska"}
+_DEMUXERS = {"MP4": "mov", "3GP": "mov", "MOV": "mov", "Matroska or WebM": "matroska"}
 _MAX_PIXELS = ImageLimits().max_pixels
 _PIXELS_OPTION = str(_MAX_PIXELS)
 _MIN_SIDE = 64
