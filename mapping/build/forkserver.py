@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import signal
+
 import mapping.build.build  # noqa: F401  what tasks of a build need
 from visloc.preloading import load_torch_if_sure
 
 load_torch_if_sure()
+# pycolmap would answer SIGTERM with a stack trace.
+signal.signal(signal.SIGTERM, signal.SIG_DFL)

@@ -185,6 +185,9 @@ def _own_sockets() -> str | None:
 
 def _start_worker(sockets: str | None) -> None:
     """Begin a worker of a build that has a folder of sockets of its own, or None."""
+    import pycolmap  # noqa: F401  loaded before its handler, which prints stack traces, is replaced
+
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     threading.Thread(target=_end_with_parent, args=(sockets,), daemon=True).start()
     use_threads(1)

@@ -37,6 +37,14 @@ def write_threads(folder: Path, name: str) -> None:
     (folder / name).write_text(f"{torch.get_num_threads()} {cv2.getNumThreads()}")
 
 
+def be_terminated(folder: Path, number: int) -> None:
+    import pycolmap  # noqa: F401
+
+    os.dup2(os.open(folder / f"stderr-{number}", os.O_WRONLY | os.O_CREAT), 2)
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(60)
+
+
 def ignore(_done: int, _total: int) -> None:
     pass
 
@@ -151,15 +159,20 @@ def test_every_item_is_done_once_and_told(tmp_path: Path, count: int) -> None:
     assert here == {count == 1}
 
 
-def test_the_folder_of_temporary_files_may_have_a_long_path(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def long_temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let temporary files lie where no server of forks can listen."""
     long = tmp_path / ("long" * 25)
     long.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(long))
     # As in a process that has started no worker yet.
-    monkeypatch.delitem(multiprocessing.current_process()._config, "tempdir", raising=False)  # type: ignore[attr-defined]
+    config = multiprocessing.current_process()._config  # type: ignore[attr-defined]
+    monkeypatch.setitem(config, "tempdir", None)  # so that what is cached here goes afterwards
     monkeypatch.setattr(forkserver._forkserver, "_forkserver_pid", None)
+
+
+@pytest.mark.usefixtures("long_temporary")
+def test_the_folder_of_temporary_files_may_have_a_long_path(tmp_path: Path) -> None:
     Workers(2).run(partial(write_square, tmp_path), [3, 4], ignore)
     assert {path.name for path in tmp_path.glob("[0-9]")} == {"3", "4"}
 
@@ -190,6 +203,19 @@ def test_a_worker_that_dies_is_an_error_with_advice() -> None:
     with pytest.raises(Unavailable, match=r"killed.*memory.*resumes") as caught:
         Workers(2).run(os._exit, [1, 1, 1], ignore)
     assert (caught.value.code, caught.value.field) == ("build.worker_died", "--workers")
+
+
+@pytest.mark.parametrize("started_by", ["forks", pytest.param("spawning", marks=pytest.mark.slow)])
+def test_terminated_worker_prints_no_stack_trace(
+    started_by: str, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    if started_by == "spawning":
+        request.getfixturevalue("long_temporary")
+    with pytest.raises(Unavailable):
+        Workers(2).run(partial(be_terminated, tmp_path), [0, 1], ignore)
+    written = [path.read_text() for path in tmp_path.glob("stderr-*")]
+    assert written
+    assert not any(written)
 
 
 def test_workers_of_a_killed_child_leave_the_folder_of_sockets_to_its_parent(
