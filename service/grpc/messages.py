@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from google.protobuf.message import Message
+from google.protobuf.unknown_fields import UnknownFieldSet
 
 from service.api import jobs
 from service.values import InstantJob, RigJob, SequenceJob
@@ -38,10 +39,11 @@ def near_of(request: pb2.ListMapsRequest) -> Near | None:
     Raises:
         InvalidInput: ``near...`` or ``request.missing_field``.
     """
-    if not request.HasField("near"):
+    given = _plain(request).get("near")
+    if given is None:
         return None
     with inside("near"):
-        words = near.Near.read(_plain(request.near))
+        words = near.Near.read(given)
     return words.to_core()
 
 
@@ -115,7 +117,21 @@ def _plain(message: Message) -> dict[str, Any]:
     """Return a message's fields as JSON would have them; fields that are not there are left out.
 
     Numbers, texts and lists without presence are there when they are zero or empty.
+
+    Raises:
+        InvalidInput: ``request.unknown_field``; protobuf passes over fields that it does not know,
+            or that come as another type.
     """
+    for unknown in UnknownFieldSet(message):
+        number, kind = unknown.field_number, message.DESCRIPTOR
+        known = kind.fields_by_number.get(number)
+        raise refuse(
+            "request.unknown_field",
+            "the message does not have this field, or not of this type",
+            field=known.name if known else str(number),
+            expected=f"a field of {kind.full_name} as in the server's localization.proto",
+            got=f"field {number} with wire type {unknown.wire_type}",
+        )
     plain = {
         _RIG_NAMES.get(field.name, field.name): _plain_value(getattr(message, field.name))
         for field in message.DESCRIPTOR.fields

@@ -6,6 +6,7 @@ import asyncio
 import base64
 import json
 import struct
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -549,6 +550,45 @@ def test_instants_of_a_stream_say_the_same_as_json() -> None:
     assert job.priors is not None
     assert job.priors.gravity is not None
     assert job.priors.gravity.world is None
+
+
+FLOATS = b"".join(struct.pack("<Bf", 4 << 3 | 5, value) for value in CAMERA["params"])
+
+
+def read_photo_message(data: bytes) -> object:
+    return localize_job_of(pb2.LocalizeRequest.FromString(data), 10**6)
+
+
+@pytest.mark.parametrize(
+    ("read", "data", "field"),
+    [
+        (read_photo_message, b"\x9a\x06\x03abc", "99"),
+        (read_photo_message, b"\x08\x05", "map"),  # a number
+        (
+            read_photo_message,
+            pb2.LocalizeRequest(options={}).SerializeToString()[:1] + b"\3\xf8\1\1",
+            "31",
+        ),
+        (
+            lambda data: rig_job_of(pb2.LocalizeRigRequest.FromString(data), LIMITS),
+            b"\xf8\1\1",
+            "31",
+        ),
+        (lambda data: near_of(pb2.ListMapsRequest.FromString(data)), b"\xf8\1\1", "31"),
+        # An app that was made for float sends four bytes of a number, where eight are read.
+        (
+            read_photo_message,
+            pb2.LocalizeRequest(camera=pb2.Camera.FromString(FLOATS)).SerializeToString(),
+            "params",
+        ),
+    ],
+)
+def test_field_of_a_message_that_would_be_passed_over_is_refused(
+    read: Callable[[bytes], object], data: bytes, field: str
+) -> None:
+    with pytest.raises(InvalidInput) as caught:
+        read(data)
+    assert (caught.value.code, caught.value.field) == ("request.unknown_field", field)
 
 
 @pytest.mark.parametrize(
