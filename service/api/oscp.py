@@ -136,7 +136,7 @@ class GeoPoseRequest(_Read):
     positions: list[GeolocationReading] = []
 
     @classmethod
-    def read_json(cls, text: bytes) -> Self:
+    def read_json(cls, text: str | bytes) -> Self:
         """Check a request written as JSON.
 
         Raises:

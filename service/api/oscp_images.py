@@ -24,7 +24,7 @@ def image_bytes(
     RGBA32: a file is known by its first bytes, bare pixels by their number.
 
     Args:
-        text: base64, as ``bytes_of_base64`` reads it.
+        text: base64.
         image_format: what the reading says.
         size: width and height, for bare pixels.
         max_bytes: largest photo.

@@ -122,15 +122,16 @@ def _plain(message: Message) -> dict[str, Any]:
         InvalidInput: ``request.unknown_field``; protobuf passes over fields that it does not know,
             or that come as another type.
     """
-    for unknown in UnknownFieldSet(message):
-        number, kind = unknown.field_number, message.DESCRIPTOR
+    unknown = UnknownFieldSet(message)
+    if len(unknown) > 0:
+        number, kind = unknown[0].field_number, message.DESCRIPTOR
         known = kind.fields_by_number.get(number)
         raise refuse(
             "request.unknown_field",
             "the message does not have this field, or not of this type",
             field=known.name if known else str(number),
             expected=f"a field of {kind.full_name} as in the server's localization.proto",
-            got=f"field {number} with wire type {unknown.wire_type}",
+            got=f"field {number} with wire type {unknown[0].wire_type}",
         )
     plain = {
         _RIG_NAMES.get(field.name, field.name): _plain_value(getattr(message, field.name))

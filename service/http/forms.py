@@ -61,17 +61,17 @@ def parse_form(
     Raises:
         InvalidInput: ``request.malformed`` or ``request.duplicate_field``.
     """
+    _, options = parse_options_header(content_type)
+    collector = _Collector(limits, _charset_of(options), text_names)
     try:
-        parts = _parts_of(content_type, body, limits, text_names)
-    except _Malformed as error:
-        field = error.part and error.part[:100]
-        raise refuse("request.malformed", str(error), field=field, expected=expected) from None
+        _collect(collector, options.get(b"boundary", b""), body)
     except FormParserError as error:
-        message, got = "the body is not multipart data", str(error)
-        raise refuse("request.malformed", message, expected=expected, got=got) from None
+        message = str(error) if isinstance(error, _Malformed) else f"no multipart data: {error}"
+        field = collector.name and collector.name[:100]
+        raise refuse("request.malformed", message, field=field, expected=expected) from None
     texts: dict[str, str] = {}
     files: dict[str, bytes] = {}
-    for name, value in parts:
+    for name, value in collector.parts:
         if name in texts or name in files:
             raise refuse("request.duplicate_field", field=name[:100])
         if isinstance(value, str):
@@ -81,26 +81,13 @@ def parse_form(
     return Form(texts, files)
 
 
-class _Malformed(Exception):
-    """A form that cannot be read or is over a limit.
-
-    Args:
-        part: the name of the part at which this shows.
-    """
-
-    def __init__(self, message: str, part: str | None = None) -> None:
-        super().__init__(message)
-        self.part = part
+class _Malformed(FormParserError):
+    """A form that cannot be read or is over a limit."""
 
 
-def _parts_of(
-    content_type: str, body: bytes, limits: FormLimits, text_names: Collection[str]
-) -> list[tuple[str, str | bytes]]:
-    _, options = parse_options_header(content_type)
-    boundary = options.get(b"boundary", b"")
+def _collect(collector: _Collector, boundary: bytes, body: bytes) -> None:
     if not boundary:
         raise _Malformed("Content-Type names no boundary of multipart data")
-    collector = _Collector(limits, _charset_of(options), text_names)
     parser = MultipartParser(
         boundary,
         {
@@ -121,11 +108,10 @@ def _parts_of(
     delimiter = b"\r\n--" + boundary
     # What has been read of a form that was cut may be a whole form of fewer parts.
     if not collector.is_whole:
-        raise _Malformed("the form is cut: its closing boundary is missing", collector.name)
+        raise _Malformed("the form is cut: its closing boundary is missing")
     closing = body.find(delimiter + b"--")
     if closing >= 0 and body.find(delimiter, closing + 1) >= 0:
         raise _Malformed("the form has parts after its closing boundary")
-    return collector.parts
 
 
 def _charset_of(options: Mapping[bytes, bytes]) -> str:
@@ -145,7 +131,6 @@ class _Collector:
         self._limits = limits
         self._charset = charset
         self._text_names = text_names
-        self._num_parts = 0
         self._header_name = self._header_value = b""
         self._is_file = self._is_text = False
         self._headers: dict[bytes, bytes] = {}
@@ -174,17 +159,16 @@ class _Collector:
         self.name = self._decoded(options[b"name"])
         encoding = self._headers.get(b"content-transfer-encoding", b"binary").strip().lower()
         if encoding not in _AS_THEY_ARE:
-            raise _Malformed("Content-Transfer-Encoding is not read; send bytes", self.name)
+            raise _Malformed("Content-Transfer-Encoding is not read; send bytes")
         self._is_file = b"filename" in options or bool(_ENCODED_FILE_NAME.search(disposition))
         self._is_text = not self._is_file and self.name in self._text_names
-        self._num_parts += 1
-        if self._num_parts > self._limits.max_parts:
-            raise _Malformed(f"the form has more than {self._limits.max_parts} parts", self.name)
+        if len(self.parts) >= self._limits.max_parts:
+            raise _Malformed(f"the form has more than {self._limits.max_parts} parts")
 
     def add_data(self, data: bytes, start: int, end: int) -> None:
         most = self._limits.max_text_bytes
         if self._is_text and len(self._data) + end - start > most:
-            raise _Malformed(f"the text has more than {most} bytes", self.name)
+            raise _Malformed(f"the text has more than {most} bytes")
         self._data += data[start:end]
 
     def end_part(self) -> None:
@@ -206,6 +190,7 @@ class _Collector:
 def _is_utf8(data: bytearray) -> bool:
     """Tell whether bytes are text in UTF-8, which has no zeros."""
     try:
-        return b"\0" not in data and data.decode() is not None
+        data.decode()
     except UnicodeDecodeError:
         return False
+    return b"\0" not in data

@@ -88,7 +88,7 @@ def check_names_once(fields: list[tuple[str, object]]) -> None:
         seen.add(name)
 
 
-def utf8_json(text: AnyStr) -> AnyStr:
+def utf8_json(text: str | bytes) -> str | bytes:
     """Return JSON without the byte order mark with which some writers begin (RFC 8259, 8.1).
 
     Raises:

@@ -79,9 +79,9 @@ def test_a_form_that_is_wrong_or_too_much_is_refused(body: bytes, code: str) -> 
     [
         (form(part(b"a", 2049 * b"1")), "a", "more than 2048 bytes"),
         (form(part(b"a", b"MQ==", more=b"\r\nContent-Transfer-Encoding: base64")), "a", "Transfer"),
-        (form(part(b"a", b"1")) + b"\r\n" + form(part(b"b", b"2")), None, "after its closing"),
+        (form(part(b"a", b"1")) + b"\r\n" + form(part(b"b", b"2")), "a", "after its closing"),
         (b"\r\nlost" + form(part(b"a", b"1")), None, "begin with the boundary"),
-        (form(part(b"a", b"1")).replace(b"\r\n", b"\n"), None, "not multipart"),
+        (form(part(b"a", b"1")).replace(b"\r\n", b"\n"), None, "no multipart"),
     ],
 )
 def test_refusal_of_a_form_names_the_part_and_the_reason(
