@@ -14,8 +14,6 @@ from visloc.errors import refuse
 
 # RFC 7578, 4.2 forbids it in forms, but clients send it, and some without ``filename``.
 _ENCODED_FILE_NAME = re.compile(rb";\s*filename\*\s*=", re.IGNORECASE)
-# Values of Content-Transfer-Encoding that leave the bytes as they are (RFC 2045, 6.2).
-_AS_THEY_ARE = (b"7bit", b"8bit", b"binary")
 # Longer than the longest boundary and the line ends that some clients send before it.
 _BEGINNING = 1024
 
@@ -158,7 +156,7 @@ class _Collector:
             raise _Malformed("a part of the form has no name in its Content-Disposition")
         self.name = self._decoded(options[b"name"])
         encoding = self._headers.get(b"content-transfer-encoding", b"binary").strip().lower()
-        if encoding not in _AS_THEY_ARE:
+        if encoding not in (b"7bit", b"8bit", b"binary"):  # bytes as they are (RFC 2045, 6.2)
             raise _Malformed("Content-Transfer-Encoding is not read; send bytes")
         self._is_file = b"filename" in options or bool(_ENCODED_FILE_NAME.search(disposition))
         self._is_text = not self._is_file and self.name in self._text_names

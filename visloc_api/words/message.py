@@ -72,11 +72,7 @@ class IncomingMessage(_Made):
                     _UNKNOWN_FIELD, "unknown field", {"name": str(name), "expected": expected}
                 )
         fields = cls.model_fields
-        return {
-            name: each
-            for name, each in value.items()
-            if each is not None or fields[name].is_required()
-        }
+        return {k: v for k, v in value.items() if v is not None or fields[k].is_required()}
 
     @classmethod
     def read(cls, value: object, limits: object = None) -> Self:
