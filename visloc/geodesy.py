@@ -60,6 +60,16 @@ def geodetic_from_enu(
     return geodetic_from_ecef(points @ enu_from_ecef(origin) + ecef_from_geodetic(origin[None]))
 
 
+def middle_of(positions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a geodetic position (3,) amid others (n, 3), also across a pole or the 180th meridian.
+
+    Medians, so that fewer than half of the positions, however far away, do not move it out of the
+    others: of the metres from the centre of the Earth, and of the heights.
+    """
+    middle = geodetic_from_ecef(np.median(ecef_from_geodetic(positions), axis=0)[None])[0]
+    return np.array([*middle[:2], np.median(positions[:, 2])])
+
+
 def ground_distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
     """Metres along the ground between two geodetic positions (3,), whose heights do not count.
 

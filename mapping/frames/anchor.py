@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -30,8 +30,9 @@ from scipy.special import stdtrit
 
 from mapping.stages.photos import MappingPhoto
 from visloc.archive import Anchor, Geodetic
+from visloc.archive.places import origin_of, similarity_on_earth
 from visloc.errors import refuse
-from visloc.geodesy import enu_from_geodetic
+from visloc.geodesy import enu_from_geodetic, geodetic_from_enu, middle_of
 from visloc.geometry import Pose, Similarity
 from visloc.kapture import Dataset
 
@@ -39,6 +40,8 @@ from visloc.kapture import Dataset
 GNSS_ERROR_M = 10.0
 # Known positions further off than this part of their spread are mistakes.
 _POSITION_ERROR = 0.05
+# Positions further out than this many times the median do not count as their spread.
+_STRAY = 10.0
 # Fewer leave a rotation open.
 _MIN_POSITIONS = 3
 # The widest intervals (95 %, plus or minus) with which positions fix a world.
@@ -86,20 +89,21 @@ class Alignment(NamedTuple):
 def known_positions(dataset: Dataset, photos: Sequence[MappingPhoto]) -> KnownPositions | None:
     """Find the poses of at least three photos, else the GNSS fixes at their timestamps, if any.
 
-    GNSS fixes in degrees become metres east, north and up of their mean; those in UTM are metres
+    GNSS fixes in degrees become metres east, north and up of their middle; those in UTM are metres
     already.
 
     Raises:
         DatasetError: ``gnss.epsg`` for fixes in another coordinate system, or in several.
+        InvalidInput: ``anchor.position`` for degrees that are no place on Earth.
     """
     posed = [row for row, photo in enumerate(photos) if photo.cam_from_world is not None]
     fixes = {fix.timestamp: fix for fix in dataset.gnss}
     rows = [row for row, photo in enumerate(photos) if photo.record.timestamp in fixes]
     if len(posed) >= _MIN_POSITIONS or (posed and not rows):
         positions = np.array([photos[row].pose.center for row in posed])
-        spread = float(np.linalg.norm(positions - np.median(positions, axis=0), axis=1).max())
         anchor = Anchor(kind="positions", images=len(posed))
-        return KnownPositions(anchor, np.array(posed), positions, _POSITION_ERROR * spread)
+        error = _POSITION_ERROR * spread_of(positions)
+        return KnownPositions(anchor, np.array(posed), positions, error)
     if not rows:
         return None
     chosen = [fixes[photos[row].record.timestamp] for row in rows]
@@ -109,13 +113,58 @@ def known_positions(dataset: Dataset, photos: Sequence[MappingPhoto]) -> KnownPo
             Anchor(kind="gnss", images=len(rows)), np.array(rows), xyz, GNSS_ERROR_M
         )
     geodetic = xyz[:, [1, 0, 2]]
-    origin = geodetic.mean(axis=0)
-    anchor = Anchor(
-        kind="gnss",
-        images=len(rows),
-        geodetic=Geodetic(latitude_deg=origin[0], longitude_deg=origin[1], altitude_m=origin[2]),
-    )
+    check_on_earth(geodetic, fixes_file(dataset))
+    origin = middle_of(geodetic)
+    anchor = Anchor(kind="gnss", images=len(rows), geodetic=_at(origin))
     return KnownPositions(anchor, np.array(rows), enu_from_geodetic(geodetic, origin), GNSS_ERROR_M)
+
+
+def about_fixes(
+    known: KnownPositions, rows: NDArray[np.int64]
+) -> tuple[KnownPositions, Similarity]:
+    """Move the origin of fixes in degrees amid those of some rows of the positions.
+
+    Returns:
+        The positions about that origin, and what takes the world that they were in to the new one.
+    """
+    old = known.anchor.geodetic
+    if old is None:
+        return known, Similarity.identity()
+    new = _at(middle_of(geodetic_from_enu(known.positions[rows], origin_of(old))))
+    moved = similarity_on_earth(new, old)
+    anchor = known.anchor.model_copy(update={"geodetic": new})
+    return replace(known, anchor=anchor, positions=moved.apply(known.positions)), moved
+
+
+def spread_of(positions: NDArray[np.float64]) -> float:
+    """Return how far positions (n, 3) extend from their median, without far strays."""
+    away = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
+    if not away.any():
+        return 0.0
+    return float(away[away <= _STRAY * np.median(away[away > 0])].max())
+
+
+def fixes_file(dataset: Dataset) -> str:
+    """Return the file of a dataset's GNSS fixes, for errors."""
+    return str(dataset.root / "sensors" / "records_gnss.txt")
+
+
+def check_on_earth(positions: NDArray[np.float64], field: str) -> None:
+    """Refuse positions (n, 3) that are not latitude, longitude (deg) and height (m).
+
+    Raises:
+        InvalidInput: ``anchor.position`` with the first that is not.
+    """
+    latitude, longitude, height = positions.T
+    # NaN fails too.
+    fine = (np.abs(latitude) <= 90) & (np.abs(longitude) <= 180) & (np.abs(height) <= 100_000)
+    if not fine.all():
+        wrong = positions[~fine][0]
+        raise refuse("anchor.position", field=field, got=", ".join(f"{value:g}" for value in wrong))
+
+
+def _at(origin: NDArray[np.float64]) -> Geodetic:
+    return Geodetic(latitude_deg=origin[0], longitude_deg=origin[1], altitude_m=origin[2])
 
 
 def coordinate_system(dataset: Dataset, receivers: set[str]) -> str:
@@ -157,8 +206,11 @@ def align_positions(
     if doubt is not None:
         return doubt
     options = pycolmap.RANSACOptions(max_error=max(max_error, 1e-9), random_seed=0)
+    # pycolmap finds nothing for points in a plane through the origin: both are moved off it.
+    source, target = _off_plane(centers), _off_plane(known)
+    moved = centers + source, known + target
     # Its stub promises a Sim3d; what comes is a dict.
-    found = cast("dict[str, Any] | None", pycolmap.estimate_sim3d_robust(centers, known, options))
+    found = cast("dict[str, Any] | None", pycolmap.estimate_sim3d_robust(*moved, options))
     agrees = np.zeros(len(centers), bool) if found is None else np.array(found["inlier_mask"], bool)
     # Any three agree nearly, and of many wrong ones a few do by chance.
     if found is None or agrees.sum() < max(_MIN_POSITIONS, len(centers) // 2 + 1):
@@ -167,11 +219,18 @@ def align_positions(
             f"{max_error:.3g}, and more than half must, three at least"
         )
     sim = found["tgt_from_src"]
-    similarity = Similarity(
-        float(sim.scale), np.array(sim.rotation.matrix()), np.array(sim.translation)
-    )
+    scale, rotation = float(sim.scale), np.array(sim.rotation.matrix())
+    translation = scale * rotation @ source + np.array(sim.translation) - target
+    similarity = Similarity(scale, rotation, translation)
     doubt = _doubt(similarity.apply(centers[agrees]), known[agrees])
     return doubt or Alignment(similarity, agrees)
+
+
+def _off_plane(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return what moves points (n, 3) as far off the origin as they extend, across their plane."""
+    middle = points.mean(axis=0)
+    _, extents, axes = np.linalg.svd(points - middle, full_matrices=False)
+    return np.asarray(extents[0] * axes[2] - middle)
 
 
 def _doubt(aligned: NDArray[np.float64], known: NDArray[np.float64]) -> str | None:

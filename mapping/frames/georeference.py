@@ -21,13 +21,16 @@ from mapping.frames.anchor import (
     MAX_DIRECTION_ERROR_DEG,
     MAX_SCALE_ERROR,
     align_positions,
+    check_on_earth,
     coordinate_system,
+    fixes_file,
+    spread_of,
 )
 from mapping.frames.anchor_error import place_error
 from mapping.stages.publishing import new_version, successor_of
 from visloc.archive import Anchor, Geodetic, Map, MapStore, down_of, write_anchored
 from visloc.errors import VislocError, refuse
-from visloc.geodesy import enu_from_geodetic
+from visloc.geodesy import enu_from_geodetic, middle_of
 from visloc.geometry import Pose, Similarity
 from visloc.kapture import Dataset
 
@@ -110,7 +113,7 @@ def correspondences_from_fixes(opened: Map, dataset: Dataset) -> Correspondences
             got=system,
         )
     positions = np.array([[fix.y, fix.x, fix.z] for _, fix in found])
-    _check_positions(positions, str(dataset.root / "sensors" / "records_gnss.txt"))
+    check_on_earth(positions, fixes_file(dataset))
     rows = [row for row, _ in found]
     return Correspondences(
         "gnss",
@@ -133,14 +136,13 @@ def read_correspondences(opened: Map, path: Path) -> Correspondences:
     rows = _read_rows(path)
     by_image = "image" in rows[0][1]
     positions = np.array([[row[name] for name in _POINT_COLUMNS[3:]] for _, row in rows], float)
-    _check_positions(positions, str(path))
+    check_on_earth(positions, str(path))
     if not by_image:
         points = np.array([[row[name] for name in "xyz"] for _, row in rows], float)
         names = tuple(f"line {number}" for number, _ in rows)
         # The spread on Earth, in metres: a unit of the map may be anything.
-        local = enu_from_geodetic(positions, np.median(positions, axis=0))
-        spread = float(np.linalg.norm(local - np.median(local, axis=0), axis=1).max())
-        error = min(GNSS_ERROR_M, _POINT_ERROR * spread)
+        local = enu_from_geodetic(positions, middle_of(positions))
+        error = min(GNSS_ERROR_M, _POINT_ERROR * spread_of(local))
         return Correspondences("correspondences", names, points, positions, error)
     by_name = {image.name: row for row, image in enumerate(opened.images)}
     for number, row in rows:
@@ -163,7 +165,7 @@ def georeference(opened: Map, known: Correspondences) -> Georeference:
         InvalidInput: ``anchor.undetermined`` when they do not determine it, ``anchor.scale`` when
             they contradict a metric map, ``anchor.gravity`` when they contradict its down.
     """
-    origin = np.median(known.positions, axis=0)
+    origin = middle_of(known.positions)
     local = enu_from_geodetic(known.positions, origin)
     found = align_positions(known.points, local, known.max_error_m)
     if isinstance(found, str):
@@ -212,7 +214,7 @@ def given_place(
     Raises:
         InvalidInput: ``anchor.position``, ``anchor.yaw``, ``anchor.scale``, ``anchor.gravity``.
     """
-    _check_positions(np.array([position]), "--latitude, --longitude, --altitude")
+    check_on_earth(np.array([position]), "--latitude, --longitude, --altitude")
     world = opened.manifest.world
     if (scale is None) != world.metric or (scale is not None and not 0 < scale < math.inf):
         raise refuse(
@@ -345,15 +347,6 @@ def _given_down(opened: Map, gravity: tuple[float, float, float] | None) -> NDAr
 
 def _angle_deg(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
     return math.degrees(math.atan2(float(np.linalg.norm(np.cross(a, b))), float(a @ b)))
-
-
-def _check_positions(positions: NDArray[np.float64], field: str) -> None:
-    latitude, longitude, height = positions.T
-    # NaN fails too.
-    fine = (np.abs(latitude) <= 90) & (np.abs(longitude) <= 180) & (np.abs(height) <= 100_000)
-    if not fine.all():
-        wrong = positions[~fine][0]
-        raise refuse("anchor.position", field=field, got=", ".join(f"{value:g}" for value in wrong))
 
 
 def _read_rows(path: Path) -> list[tuple[int, Mapping[str, str | float]]]:

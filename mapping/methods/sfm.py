@@ -17,6 +17,8 @@ from pydantic import JsonValue
 
 from mapping.frames.anchor import (
     MAX_SCALE_ERROR,
+    KnownPositions,
+    about_fixes,
     align_positions,
     at_own_scale,
     known_positions,
@@ -412,7 +414,7 @@ def _anchored(
     known = known_positions(dataset, photos)
     if known is None:
         return *free, (f"nothing says where the photos were taken: {arbitrary}",), ()
-    placed = np.array([model.views[row] is not None for row in known.photos])
+    placed = np.flatnonzero([model.views[row] is not None for row in known.photos])
     views = [view for row in known.photos if (view := model.views[row]) is not None]
     centers = np.array([view.cam_from_world.center for view in views]).reshape(-1, 3)
     positions = known.positions[placed]
@@ -424,12 +426,15 @@ def _anchored(
         )
         return *free, (note,), ()
     similarity, agrees = found
-    centers, positions = centers[agrees], positions[agrees]
-    notes: tuple[str, ...] = ()
+    notes = _on_unused(known, placed, similarity.apply(centers), photos, agrees)
+    known, moved = about_fixes(known, placed[agrees])
+    similarity = moved @ similarity
+    centers, positions = centers[agrees], known.positions[placed[agrees]]
     doubts: tuple[Doubt, ...] = ()
     if unit_error is not None:
         margin = scale_margin(similarity.apply(centers), positions)
-        notes, doubts = _on_unit(similarity.scale, margin, unit_error)
+        on_unit, doubts = _on_unit(similarity.scale, margin, unit_error)
+        notes = (*notes, *on_unit)
         similarity = at_own_scale(similarity, centers, positions)
     aligned = similarity.apply(centers)
     rms = float(np.sqrt(np.mean(np.sum((aligned - positions) ** 2, axis=1))))
@@ -439,6 +444,25 @@ def _anchored(
         geodetic = anchor.geodetic.model_copy(update={"error": error})
         anchor = anchor.model_copy(update={"geodetic": geodetic})
     return similarity, anchor, notes, doubts
+
+
+def _on_unused(
+    known: KnownPositions,
+    rows: NDArray[np.int64],
+    aligned: NDArray[np.float64],
+    photos: Sequence[MappingPhoto],
+    agrees: NDArray[np.bool_],
+) -> tuple[str, ...]:
+    """Return a note on known positions that the others contradict, the furthest off first."""
+    off = np.linalg.norm(aligned - known.positions[rows], axis=1)
+    wrong = [row for row in np.argsort(-off, kind="stable") if not agrees[row]]
+    if not wrong:
+        return ()
+    names = some([f"{photos[known.photos[rows[row]]].name} ({off[row]:.3g} off)" for row in wrong])
+    return (
+        f"{len(wrong)} of {len(rows)} known positions ({known.anchor.kind}) contradict the others "
+        f"by more than {known.max_error:.3g} and are not used: {names}",
+    )
 
 
 def _on_unit(

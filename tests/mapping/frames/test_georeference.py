@@ -38,9 +38,11 @@ def centers_of(opened: Map) -> NDArray[np.float64]:
     return np.array([Pose.from_quaternion(p[:4], p[4:]).center for p in opened.image_poses])
 
 
-def positions_of(points: NDArray[np.float64], scale: float = 1.0) -> NDArray[np.float64]:
+def positions_of(
+    points: NDArray[np.float64], scale: float = 1.0, home: NDArray[np.float64] = HOME
+) -> NDArray[np.float64]:
     """Where points of the map's world are on Earth."""
-    return geodetic_from_enu(TURNED.apply(scale * points), HOME)
+    return geodetic_from_enu(TURNED.apply(scale * points), home)
 
 
 def not_metric(opened: Map) -> Map:
@@ -70,10 +72,15 @@ def dataset_with_fixes(
     return Dataset(Path("dataset"), sensors, {}, {}, (), (), fixes)
 
 
-def misplacement(geodetic: Geodetic, points: NDArray[np.float64], scale: float = 1.0) -> float:
+def misplacement(
+    geodetic: Geodetic,
+    points: NDArray[np.float64],
+    scale: float = 1.0,
+    home: NDArray[np.float64] = HOME,
+) -> float:
     """How far points are put from where they are, metres at most."""
     put = ecef_from_geodetic(geodetic_from_enu(enu_of(points, geodetic), origin_of(geodetic)))
-    return float(np.abs(put - ecef_from_geodetic(positions_of(points, scale))).max())
+    return float(np.abs(put - ecef_from_geodetic(positions_of(points, scale, home))).max())
 
 
 def csv_file(path: Path, header: str, rows: list[str]) -> Path:
@@ -172,11 +179,36 @@ def test_fixes_in_metres_or_of_other_photos_are_refused(room: Map) -> None:
     assert caught.value.code == "anchor.fixes"
 
 
-def test_given_points_put_the_map_where_it_is(room: Map, tmp_path: Path) -> None:
-    path = csv_file(tmp_path / "points.csv", POINT_HEADER, point_rows(positions_of(POINTS)))
+FLOOR = POINTS * [1, 1, 0]  # z exactly 0
+
+
+@pytest.mark.parametrize("points", [POINTS, FLOOR, FLOOR[:3]], ids=["space", "floor", "three"])
+@pytest.mark.parametrize("home", [HOME, (-16.8, 180.0, 7.0), (89.99999, -3.0, 7.0)])
+def test_given_points_put_the_map_where_it_is(
+    room: Map,
+    tmp_path: Path,
+    points: NDArray[np.float64],
+    home: tuple[float, float, float],
+) -> None:
+    rows = point_rows(positions_of(points, home=np.array(home)), points)
+    path = csv_file(tmp_path / "points.csv", POINT_HEADER, rows)
     found = georeference(room, read_correspondences(room, path))
     assert found.anchor.kind == "correspondences"
-    assert found.anchor.images == len(POINTS)
+    assert found.anchor.images == len(points)
+    assert found.anchor.geodetic is not None
+    assert misplacement(found.anchor.geodetic, POINTS, home=np.array(home)) < 1e-6
+
+
+def test_one_point_of_another_country_is_named_and_hides_no_smaller_mistake(
+    room: Map, tmp_path: Path
+) -> None:
+    points = np.concatenate([FLOOR, FLOOR + np.array([40.0, 0.0, 0.0])])
+    positions = positions_of(points)
+    positions[0] = 52.52, 13.405, 34.0
+    positions[4, 2] += 6.0  # less than 10 m, more than 5 % of the spread
+    path = csv_file(tmp_path / "points.csv", POINT_HEADER, point_rows(positions, points))
+    found = georeference(room, read_correspondences(room, path))
+    assert np.flatnonzero(~found.agrees).tolist() == [0, 4]
     assert found.anchor.geodetic is not None
     assert misplacement(found.anchor.geodetic, POINTS) < 1e-6
 
