@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -25,6 +26,11 @@ from visloc.kapture.dataset import UNKNOWN_CAMERA
 from visloc.photo_formats import FORMATS, SUFFIXES
 
 _GNSS = "gnss"
+# Some programs write words in place of the letters of EXIF.
+_NORTH = {"N": 1, "S": -1, "NORTH": 1, "SOUTH": -1}
+_EAST = {"E": 1, "W": -1, "EAST": 1, "WEST": -1}
+# Above and below the sea; since EXIF 3.0, 0 and 1 are the ellipsoid, and 2 and 3 the sea.
+_ALTITUDE_SIGNS: dict[float | None, int] = {0: 1, 1: -1, 2: 1, 3: -1}
 # Beside what begins with a dot: what Windows, macOS and network storage put among photos.
 _SYSTEM_NAMES = {"thumbs.db", "desktop.ini", "@eadir", "__macosx", "$recycle.bin"}
 _SYSTEM = "hidden, or of the operating system"
@@ -48,7 +54,7 @@ class _Found:
         width: of the stored pixels.
         height: of the stored pixels.
         taken: EXIF time, as text that sorts; None without.
-        fix: longitude, latitude in degrees; None without.
+        fix: longitude, latitude in degrees; None without; why it cannot be used.
         altitude_m: above sea level; None without.
         dop: dilution of precision, 0 when unknown.
     """
@@ -59,7 +65,7 @@ class _Found:
     width: int
     height: int
     taken: str | None
-    fix: tuple[float, float] | None
+    fix: tuple[float, float] | str | None
     altitude_m: float | None
     dop: float
 
@@ -303,14 +309,16 @@ def _cameras(found: list[_Found]) -> dict[tuple[object, ...], Sensor]:
 def _gnss(found: list[_Found], notes: list[str]) -> tuple[GnssRecord, ...]:
     fixes = []
     num_flat = 0
+    unused = Counter(photo.fix for photo in found if isinstance(photo.fix, str))
+    notes += [f"{num} GPS positions are not used: {why}" for why, num in sorted(unused.items())]
     for rank, photo in enumerate(found):
-        if photo.fix is None:
+        if photo.fix is None or isinstance(photo.fix, str):
             continue
         num_flat += photo.altitude_m is None
         altitude = photo.altitude_m or 0.0
         fixes.append(GnssRecord(rank, _GNSS, *photo.fix, z=altitude, utc=0.0, dop=photo.dop))
     if num_flat:
-        notes.append(f"{num_flat} GPS positions have no altitude: 0 was taken")
+        notes.append(f"{num_flat} GPS positions have no altitude that can be read: 0 was taken")
     return tuple(fixes)
 
 
@@ -334,32 +342,54 @@ def _number(value: object) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def _fix(gps: _Tags) -> tuple[float, float] | None:
+def _fix(gps: _Tags) -> tuple[float, float] | str | None:
+    """Return longitude and latitude (deg); None without; why they cannot be used."""
     tags = ExifTags.GPS
-    longitude = _degrees(gps.get(tags.GPSLongitude), gps.get(tags.GPSLongitudeRef), "EW", 180)
-    latitude = _degrees(gps.get(tags.GPSLatitude), gps.get(tags.GPSLatitudeRef), "NS", 90)
-    if longitude is None or latitude is None or (longitude, latitude) == (0.0, 0.0):
-        return None  # 0, 0 is what receivers write before they know
+    if tags.GPSLongitude not in gps and tags.GPSLatitude not in gps:
+        return None
+    try:
+        longitude = _degrees(gps.get(tags.GPSLongitude), gps.get(tags.GPSLongitudeRef), _EAST, 180)
+        latitude = _degrees(gps.get(tags.GPSLatitude), gps.get(tags.GPSLatitudeRef), _NORTH, 90)
+    except ValueError as error:
+        return str(error)
+    if (longitude, latitude) == (0.0, 0.0):
+        return "they are 0, 0, which receivers write before they know"
     return longitude, latitude
 
 
-def _degrees(value: object, letter: object, letters: str, limit: float) -> float | None:
-    """Return degrees of degrees, minutes, seconds and the letter of the hemisphere."""
-    if not isinstance(value, tuple) or len(value) != 3 or letter not in tuple(letters):
-        return None
-    parts = [_number(part) for part in value]
-    if any(part is None or part < 0 for part in parts):
-        return None
-    degrees, minutes, seconds = (part or 0.0 for part in parts)
-    total = degrees + minutes / 60 + seconds / 3600
-    if total > limit:
-        return None
-    return total if letter == letters[0] else -total
+def _degrees(value: object, letter: object, signs: Mapping[str, int], limit: float) -> float:
+    """Return degrees of degrees, minutes, seconds and the letter of the hemisphere.
+
+    Numbers at the end that are not there or 0/0 are 0: the one before them has decimals then.
+
+    Raises:
+        ValueError: why there are none.
+    """
+    letter = letter.decode("latin-1") if isinstance(letter, bytes) else letter
+    sign = signs.get(exif_text(letter).upper())
+    if sign is None:
+        raise ValueError(f"the letter of the hemisphere ({'/'.join(signs)}) is missing or unknown")
+    parts = [_number(part) for part in (value if isinstance(value, tuple) else (value,))]
+    while parts and parts[-1] is None:
+        parts.pop()
+    numbers = [number for number in parts if number is not None]
+    total = sum(number / 60**power for power, number in enumerate(numbers))
+    if (
+        not 1 <= len(parts) == len(numbers) <= 3
+        or min(numbers) < 0
+        or max(numbers[1:], default=0) > 60
+        # Decimals of a number, and then what they stand for once more.
+        or any(number % 1 and any(numbers[i + 1 :]) for i, number in enumerate(numbers))
+        or total > limit
+    ):
+        raise ValueError("they are not degrees, minutes and seconds within the range of each")
+    return sign * total
 
 
 def _altitude(gps: _Tags) -> float | None:
     altitude = _number(gps.get(ExifTags.GPS.GPSAltitude))
-    if altitude is None:
-        return None
-    below = gps.get(ExifTags.GPS.GPSAltitudeRef) in (1, b"\x01")
-    return -altitude if below else altitude
+    reference = gps.get(ExifTags.GPS.GPSAltitudeRef, 0)
+    if isinstance(reference, bytes):
+        reference = int.from_bytes(reference, "big")
+    sign = _ALTITUDE_SIGNS.get(_number(reference))
+    return None if altitude is None or sign is None else sign * altitude

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 from PIL import ExifTags, Image
+from PIL.TiffImagePlugin import IFDRational
 
 from mapping.importers import import_dataset
 from mapping.importers.images import read
@@ -119,19 +120,70 @@ def test_gps_becomes_gnss_fixes(tmp_path: Path) -> None:
     assert any("1 GPS positions have no altitude" in note for note in read(tmp_path).notes)
 
 
+UNKNOWN = IFDRational(0, 0)
+LETTER, NUMBERS = "letter of the hemisphere", "not degrees, minutes and seconds"
+
+
 @pytest.mark.parametrize(
-    "changes",
+    ("changes", "why"),
     [
-        {"GPSLatitudeRef": "X"},
-        {"GPSLatitude": (95.0, 0.0, 0.0)},
-        {"GPSLatitude": (0.0, 0.0, 0.0), "GPSLongitude": (0.0, 0.0, 0.0)},
-        {"GPSLatitude": None},
-        {"GPSLongitude": (1.0, 2.0)},
+        ({"GPSLatitudeRef": "X"}, LETTER),
+        ({"GPSLatitudeRef": None}, LETTER),
+        ({"GPSLatitudeRef": ""}, LETTER),
+        ({"GPSLongitudeRef": "N"}, LETTER),
+        ({"GPSLongitudeRef": "O"}, LETTER),  # Ost or Ouest
+        ({"GPSLatitude": (95.0, 0.0, 0.0)}, NUMBERS),
+        ({"GPSLatitude": (89.0, 60.0, 1.0)}, NUMBERS),
+        ({"GPSLatitude": (45.0, 30.0, 3600.0)}, NUMBERS),
+        ({"GPSLatitude": (45.5, 30.0, 0.0)}, NUMBERS),  # half a degree once or twice
+        ({"GPSLatitude": (45.0, UNKNOWN, 30.0)}, NUMBERS),
+        ({"GPSLatitude": (UNKNOWN, UNKNOWN, UNKNOWN)}, NUMBERS),
+        ({"GPSLatitude": (1.0, 2.0, 3.0, 4.0)}, NUMBERS),
+        ({"GPSLatitude": None}, NUMBERS),
+        ({"GPSLongitude": (181.0, 2.0)}, NUMBERS),
+        ({"GPSLatitude": (0.0, 0.0, 0.0), "GPSLongitude": (0.0, 0.0, 0.0)}, "they are 0, 0"),
     ],
 )
-def test_gps_that_is_no_place_is_left_out(tmp_path: Path, changes: dict[str, Any]) -> None:
+def test_gps_that_is_no_place_is_counted(tmp_path: Path, changes: dict[str, Any], why: str) -> None:
     write_photo(tmp_path / "a.jpg", gps=fix(**changes))
-    assert read(tmp_path).gnss == ()
+    write_photo(tmp_path / "b.jpg", gps=fix(**changes))
+    write_photo(tmp_path / "c.jpg", gps={GPS_TAGS["GPSDateStamp"]: "2026:05:01"})
+    model = read(tmp_path)
+    assert model.gnss == ()
+    (note,) = [note for note in model.notes if "GPS" in note]
+    assert note.startswith("2 GPS positions are not used: ")
+    assert why in note
+
+
+@pytest.mark.parametrize(
+    ("changes", "place"),
+    [
+        ({"GPSLatitudeRef": "n", "GPSLongitudeRef": "w"}, (-5.25, 45.51, 300.5)),
+        ({"GPSLatitudeRef": "North", "GPSLongitudeRef": "WEST"}, (-5.25, 45.51, 300.5)),
+        ({"GPSLatitudeRef": " s ", "GPSLongitudeRef": "e"}, (5.25, -45.51, 300.5)),
+        ({"GPSLatitude": (45.0, 30.6, UNKNOWN)}, (5.25, -45.51, 300.5)),
+        ({"GPSLatitude": (45.51, UNKNOWN, UNKNOWN)}, (5.25, -45.51, 300.5)),
+        ({"GPSLatitude": (45.51, 0.0, 0.0)}, (5.25, -45.51, 300.5)),
+        ({"GPSLatitude": (45.0, 30.6), "GPSLongitude": 5.25}, (5.25, -45.51, 300.5)),
+        ({"GPSLongitude": (180.0, 0.0, 0.0)}, (180.0, -45.51, 300.5)),
+        ({"GPSLatitude": (0.0, 0.0, 0.0)}, (5.25, 0.0, 300.5)),
+        ({"GPSAltitudeRef": b"\x01"}, (5.25, -45.51, -300.5)),
+        ({"GPSAltitudeRef": b"\x02"}, (5.25, -45.51, 300.5)),
+        ({"GPSAltitudeRef": b"\x03"}, (5.25, -45.51, -300.5)),
+        ({"GPSAltitudeRef": None}, (5.25, -45.51, 300.5)),
+        ({"GPSAltitudeRef": b"\x07"}, (5.25, -45.51, 0.0)),
+        ({"GPSAltitude": UNKNOWN}, (5.25, -45.51, 0.0)),
+    ],
+)
+def test_gps_as_cameras_and_programs_write_it_is_read(
+    tmp_path: Path, changes: dict[str, Any], place: tuple[float, float, float]
+) -> None:
+    write_photo(tmp_path / "a.jpg", gps=fix(**changes))
+    model = read(tmp_path)
+    (found,) = model.gnss
+    assert (found.x, found.y, found.z) == pytest.approx(place)
+    told = "1 GPS positions have no altitude that can be read: 0 was taken" in model.notes
+    assert told == (place[2] == 0)
 
 
 def test_every_file_is_used_or_left_out_with_its_reason(tmp_path: Path) -> None:
