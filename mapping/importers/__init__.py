@@ -131,7 +131,8 @@ def read_model(
     """
     if name not in IMPORTERS:
         raise refuse("import.unknown_format", field="FORMAT", expected=IMPORTERS, got=name)
-    if photos is not None and not photos.is_dir():
+    # That of a bag is written.
+    if photos is not None and not photos.is_dir() and (name != "rosbag" or photos.exists()):
         raise refuse("import.photos", field="--photos", got=str(photos))
     module, function = IMPORTERS[name]
     read: Callable[..., ImportedModel] = getattr(import_module(module), function)

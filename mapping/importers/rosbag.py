@@ -11,6 +11,7 @@ import re
 import shutil
 from bisect import bisect_left
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -43,6 +44,9 @@ class _Topic:
     Attributes:
         sensor: its id in the dataset, and the folder of its photos.
         last: the photo that was taken last: its time, and ``world_from_cam``.
+        camera: of photos of ``size``; None where the bag does not say.
+        wrong: why its photos are left out after all.
+        depth_camera: of the depth that the photos have.
     """
 
     name: str
@@ -54,6 +58,9 @@ class _Topic:
     unreadable: int = 0
     frame: str = ""
     size: tuple[int, int] | None = None
+    camera: Camera | None = None
+    wrong: str | None = None
+    depth_camera: Camera | None = None
     images: list[ImportedImage] = field(default_factory=list)
     times: set[int] = field(default_factory=set)
 
@@ -71,7 +78,8 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
     """
     with open_bag(path) as bag:
         if not bag.photos:
-            got = ", ".join(f"{topic}: {encoding}" for topic, encoding in bag.left_out.items())
+            others = dict.fromkeys(bag.depth, "depth") | dict(bag.left_out)
+            got = "; ".join(f"{topic}: {why}" for topic, why in sorted(others.items()))
             raise refuse("bag.no_photos", field=str(path), got=got or None)
         path = path.resolve()  # "." has no name
         folder = path.with_name(f"{path.stem}_photos") if photos is None else photos
@@ -110,6 +118,8 @@ def _sensors(topics: Iterable[str]) -> dict[str, str]:
 def _take(bag: Bag, topic: _Topic, picture: Picture, folder: Path) -> None:
     """Write a photo and note it, unless the camera has hardly moved since the last."""
     topic.seen += 1
+    if topic.wrong is not None:
+        return
     if not topic.frame:
         topic.frame = picture.frame
         if bag.transforms.moves(picture.frame):
@@ -125,10 +135,15 @@ def _take(bag: Bag, topic: _Topic, picture: Picture, folder: Path) -> None:
     name = f"{topic.sensor}/{picture.time_ns}{_suffix(picture)}"
     _write(folder / name, picture)
     try:
-        topic.size = photo_size(folder / name)
-    except DatasetError:  # one broken photo of an hour
+        size = photo_size(folder / name)
+        assert size is not None  # of what was just written
+        if topic.size is None:
+            topic.camera, topic.size = _fitted(bag, topic.name, size), size
+    except DatasetError as error:
         (folder / name).unlink()
-        topic.unreadable += 1
+        if error.code == "bag.camera":
+            topic.wrong = f"{error.message} (expected {error.expected}, got {error.got})"
+        topic.unreadable += 1  # one broken photo of an hour
         return
     topic.times.add(picture.time_ns)
     topic.last = picture.time_ns, world_from_cam
@@ -177,14 +192,17 @@ def _add_depth(bag: Bag, topics: Iterable[_Topic], folder: Path) -> dict[str, st
             for topic in topics:
                 if topic.frame != frame or found.get(topic.sensor, depth) != depth:
                     continue
-                if bag.cameras[depth] is None and bag.cameras[topic.name] is None:
-                    continue
                 index = _nearest(topic.images, time_ns)
                 if index is None or topic.images[index].depth is not None:
                     continue
                 image = topic.images[index]
                 name = f"{depth_sensor_id(topic.sensor)}/{image.timestamp}.png"
                 units = np.round(depth_in_metres(message, depth) / DEFAULT_DEPTH_SCALE)
+                with suppress(DatasetError):
+                    height, width = units.shape
+                    topic.depth_camera = _fitted(bag, depth, (width, height)) or topic.camera
+                if topic.depth_camera is None:
+                    continue
                 units[units > _MOST_UNITS] = 0  # further than a depth map can say
                 _write_depth(folder / name, units.astype(np.uint16))
                 topic.images[index] = replace(image, depth=name)
@@ -205,12 +223,20 @@ def _model(
 ) -> ImportedModel:
     sensors: dict[str, Sensor] = {}
     notes = [
-        f"{topic}: left out, its encoding {encoding!r} is not supported"
-        for topic, encoding in bag.left_out.items()
+        *(f"{topic}: left out, {why}" for topic, why in sorted(bag.left_out.items())),
+        *bag.notes,
+    ]
+    notes += [
+        f"{topic}: messages without a stamp (0) have their time of arrival, which is later"
+        for topic in sorted(bag.unstamped)
+        if not topic.endswith("tf_static")
     ]
     unused = [topic for topic in bag.depth if topic not in depth_topics.values()]
     notes += [f"{topic}: depth left out, of no photo's frame, time and camera" for topic in unused]
     for topic in topics:
+        if topic.wrong is not None:
+            notes.append(f"{topic.name}: left out, {topic.wrong}")
+            continue
         taken = len(topic.images)
         notes.append(f"{topic.name}: {taken} of {topic.seen} photos taken, written to {folder}")
         if topic.unposed:
@@ -223,19 +249,25 @@ def _model(
             notes.append(f"{topic.name}: the world is the frame {topic.world!r}")
         if topic.size is None:
             continue
-        camera = bag.cameras[topic.name]
-        sensors[topic.sensor] = _sensor(topic.sensor, camera, topic.size, topic.name)
-        if topic.sensor in depth_topics:
-            used = bag.cameras[depth_topics[topic.sensor]] or camera
-            assert used is not None  # else it was not taken
+        told = bag.cameras[topic.name]
+        if told is not None and topic.camera != told:
+            of, to = (f"{w} x {h}" for w, h in ((told.width, told.height), topic.size))
+            notes.append(f"{topic.name}: its camera is of {of}, scaled to the photos' {to}")
+        sensors[topic.sensor] = (
+            Sensor(topic.sensor, "", "camera", (UNKNOWN_CAMERA, *map(str, topic.size)), None)
+            if topic.camera is None
+            else Sensor.with_camera(topic.sensor, topic.camera)
+        )
+        if topic.depth_camera is not None:
             depth = depth_sensor_id(topic.sensor)
-            sensors[depth] = Sensor.with_camera(depth, used, "depth")
+            sensors[depth] = Sensor.with_camera(depth, topic.depth_camera, "depth")
     worlds = {topic.world for topic in topics if topic.images}
     if len(worlds) > 1:
         raise refuse("bag.worlds", field=str(bag.path), got=sorted(map(str, worlds)))
     images = tuple(image for topic in topics for image in topic.images)
     if not images:
-        raise refuse("bag.no_photos", "no photo has a pose", field=str(bag.path), got=notes)
+        message = "no photo has a pose and a camera that can be used"
+        raise refuse("bag.no_photos", message, field=str(bag.path), got=notes)
     return ImportedModel(
         sensors=sensors,
         images=images,
@@ -245,15 +277,21 @@ def _model(
     )
 
 
-def _sensor(name: str, camera: Camera | None, size: tuple[int, int], topic: str) -> Sensor:
-    if camera is None:
-        return Sensor(name, "", "camera", (UNKNOWN_CAMERA, *map(str, size)), None)
-    if (camera.width, camera.height) != size:
+def _fitted(bag: Bag, topic: str, size: tuple[int, int]) -> Camera | None:
+    """Return the camera of a topic whose pictures are of a size; None where the bag does not say.
+
+    Raises:
+        DatasetError: ``bag.camera`` for pictures that do not show all that the camera does.
+    """
+    camera = bag.cameras[topic]
+    if camera is None or (camera.width, camera.height) == size:
+        return camera
+    if topic in bag.cropped or not camera.has_aspect_of(*size):
         raise refuse(
             "bag.camera",
-            "the camera of a topic is of another size than its photos",
+            "the camera of a topic is of another size than its pictures",
             field=topic,
             expected=f"{camera.width} x {camera.height}",
             got=f"{size[0]} x {size[1]}",
         )
-    return Sensor.with_camera(name, camera)
+    return camera.scaled(*size)

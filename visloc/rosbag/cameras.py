@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from visloc.errors import refuse
 from visloc.geometry import Camera
@@ -15,13 +16,16 @@ _CORNER = 0.5  # ROS, as OpenCV, counts from the centre of the top-left pixel
 def camera_from_info(info: Any, topic: str, *, rectified: bool = False) -> Camera | None:
     """Return the camera of raw pictures; None where it was not calibrated (K is zero).
 
-    That of rectified pictures is P, without distortion.
+    That of rectified pictures is P, without distortion. K and P are of the whole sensor: the
+    pictures show its region of interest (``is_cropped``), binned.
 
-    ``plumb_bob`` and ``rational_polynomial`` are OpenCV's models of 5 and 8 numbers,
-    ``equidistant`` its fisheye model (REP 104 and sensor_msgs/distortion_models).
+    ``plumb_bob`` and ``rational_polynomial`` are one model of OpenCV's, of up to 8 numbers; drivers
+    write either name. ``equidistant`` is its fisheye model, of 4 (REP 104 and
+    sensor_msgs/distortion_models). Zeros at the end mean nothing.
 
     Raises:
-        DatasetError: ``bag.camera``: a distortion model that we lack; ``camera.*``.
+        DatasetError: ``bag.camera``: a distortion model that we lack, or a region beyond the
+            sensor; ``camera.*``.
     """
     k, d, p = (  # ROS 1 wrote them in capitals
         np.asarray(getattr(info, name.upper() if hasattr(info, name.upper()) else name), np.float64)
@@ -32,24 +36,50 @@ def camera_from_info(info: Any, topic: str, *, rectified: bool = False) -> Camer
         k, d = p[:, :3], d[:0]
     if k[0, 0] == 0:
         return None
-    pinhole = (k[0, 0], k[1, 1], k[0, 2] + _CORNER, k[1, 2] + _CORNER)
-    size = int(info.width), int(info.height)
-    model = info.distortion_model
-    if not d.any():
+    left, top, wide, high = _region(info)
+    if left + wide > info.width or top + high > info.height:
+        raise refuse(
+            "bag.camera",
+            "the region of interest of a camera reaches beyond its sensor",
+            field=topic,
+            expected=f"within {info.width} x {info.height}",
+            got=f"{wide} x {high} at {left}, {top}",
+        )
+    by_x, by_y = max(int(info.binning_x), 1), max(int(info.binning_y), 1)
+    pinhole = (
+        *(k[0, 0] / by_x, k[1, 1] / by_y),
+        *((k[0, 2] + _CORNER - left) / by_x, (k[1, 2] + _CORNER - top) / by_y),
+    )
+    size = wide // by_x, high // by_y
+    model, numbers = info.distortion_model, np.trim_zeros(d, "b")
+    fisheye = len(d) > 0 and model in ("equidistant", "fisheye")  # without distortion, too
+    if len(numbers) == 0 and not fisheye:
         return Camera("PINHOLE", *size, pinhole)
-    if model == "plumb_bob" and len(d) == 5:
-        if d[4] == 0:
-            return Camera("OPENCV", *size, (*pinhole, *d[:4]))
-        return Camera("FULL_OPENCV", *size, (*pinhole, *d, 0.0, 0.0, 0.0))
-    if model == "plumb_bob" and len(d) == 4:
-        return Camera("OPENCV", *size, (*pinhole, *d))
-    if model == "rational_polynomial" and len(d) == 8:
-        return Camera("FULL_OPENCV", *size, (*pinhole, *d))
-    if model in ("equidistant", "fisheye") and len(d) == 4:
-        return Camera("OPENCV_FISHEYE", *size, (*pinhole, *d))
+    if fisheye and len(numbers) <= 4:
+        return Camera("OPENCV_FISHEYE", *size, (*pinhole, *_padded(numbers, 4)))
+    if model in ("plumb_bob", "rational_polynomial") and len(numbers) <= 8:
+        if len(numbers) <= 4:
+            return Camera("OPENCV", *size, (*pinhole, *_padded(numbers, 4)))
+        return Camera("FULL_OPENCV", *size, (*pinhole, *_padded(numbers, 8)))
     raise refuse(
         "bag.camera",
         field=topic,
-        expected="plumb_bob (4 or 5 numbers), rational_polynomial (8) or equidistant (4)",
-        got=f"{model!r} with {len(d)} numbers",
+        expected="plumb_bob or rational_polynomial (up to 8 numbers) or equidistant (up to 4)",
+        got=f"{model!r} with {len(numbers)} numbers",
     )
+
+
+def is_cropped(info: Any) -> bool:
+    """Tell whether pictures show only a part of the sensor, so that another size is no scaling."""
+    return _region(info) != (0, 0, int(info.width), int(info.height))
+
+
+def _region(info: Any) -> tuple[int, int, int, int]:
+    """Return left, top, width and height of what is read of the sensor, before binning."""
+    roi = info.roi
+    left, top = int(roi.x_offset), int(roi.y_offset)
+    return left, top, int(roi.width) or info.width - left, int(roi.height) or info.height - top
+
+
+def _padded(numbers: NDArray[np.float64], length: int) -> tuple[float, ...]:
+    return (*numbers.tolist(), *[0.0] * (length - len(numbers)))

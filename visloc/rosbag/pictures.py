@@ -52,9 +52,10 @@ class Picture:
         return _png(self.pixels)
 
 
-def is_depth(message: Any) -> bool:
-    """Tell whether an ``Image`` holds depth (REP 118)."""
-    return getattr(message, "encoding", "") in _DEPTHS
+def is_depth(message: Any, topic: str) -> bool:
+    """Tell whether an ``Image`` holds depth (REP 118); grey of 16 bits only by its topic's name."""
+    encoding = getattr(message, "encoding", "")
+    return encoding in _DEPTHS and (encoding != "mono16" or "depth" in topic.lower())
 
 
 def has_known_colors(message: Any) -> bool:
@@ -81,7 +82,7 @@ def depth_in_metres(message: Any, topic: str) -> NDArray[np.float32]:
     Raises:
         DatasetError: ``bag.picture``: an encoding that is no depth, or too few bytes.
     """
-    if not is_depth(message):
+    if message.encoding not in _DEPTHS:
         raise refuse("bag.picture", field=topic, expected=_DEPTHS, got=message.encoding)
     kind = np.dtype(_DEPTHS[message.encoding])
     depth = _rows(message, topic, 1, kind)[..., 0]

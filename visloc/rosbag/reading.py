@@ -11,7 +11,7 @@ from typing import Any
 
 from visloc.errors import InvalidInput, VislocError, refuse
 from visloc.geometry import Camera, Pose
-from visloc.rosbag.cameras import camera_from_info
+from visloc.rosbag.cameras import camera_from_info, is_cropped
 from visloc.rosbag.pictures import Picture, has_known_colors, is_depth, pixels_of
 from visloc.rosbag.transforms import Transforms
 
@@ -30,9 +30,13 @@ class Bag:
         path: the file or folder.
         photos: topics of photos; without compressed copies of others.
         depth: topics of depth pictures.
-        left_out: topics of pictures whose encoding we lack, such as Bayer patterns, and the
-            encoding.
+        left_out: other topics of pictures, and why: their encoding, such as Bayer patterns, or
+            their camera.
         cameras: intrinsics by topic of photos or depth; None where the bag does not say.
+        cropped: topics whose camera is of a part of the sensor, and of no other size of picture.
+        notes: what was assumed, and which ``camera_info`` was not used.
+        unstamped: topics of messages without a stamp, which have their time of arrival; grows
+            while the bag is read.
         transforms: the frames of the bag.
     """
 
@@ -41,6 +45,9 @@ class Bag:
     depth: tuple[str, ...]
     left_out: Mapping[str, str]
     cameras: Mapping[str, Camera | None]
+    cropped: frozenset[str]
+    notes: tuple[str, ...]
+    unstamped: set[str]
     transforms: Transforms
     _reader: Any
 
@@ -71,7 +78,7 @@ class Bag:
         chosen = [each for each in self._reader.connections if each.topic in topics]
         if chosen:
             with _reading(self.path):
-                yield from _decoded(self._reader, chosen)
+                yield from _decoded(self._reader, chosen, self.unstamped)
 
 
 @contextmanager
@@ -81,7 +88,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
     The whole bag is read once for transforms, but no photo is kept.
 
     Raises:
-        DatasetError: ``bag.unreadable``, ``bag.camera``.
+        DatasetError: ``bag.unreadable``.
         Unavailable: ``bag.no_rosbags``.
     """
     try:
@@ -91,6 +98,9 @@ def open_bag(path: Path) -> Iterator[Bag]:
         raise refuse("bag.no_rosbags") from None
     if not path.exists():
         raise refuse("bag.unreadable", field=str(path), got="nothing there")
+    if path.suffix != ".bag" and not (path / "metadata.yaml").is_file():
+        got = "a folder without metadata.yaml" if path.is_dir() else "a file that is no .bag"
+        raise refuse("bag.unreadable", field=str(path), got=got)
     with ExitStack() as opened:
         with _reading(path):
             types = get_typestore(Stores.LATEST)
@@ -123,25 +133,35 @@ def _described(reader: Any, path: Path) -> Bag:
         kind: [each for each in reader.connections if each.msgtype == kind]
         for kind in (_IMAGE, _COMPRESSED, _INFO, _TF, _OLD_TF, _ODOMETRY)
     }
-    transforms = _transforms(reader, of_kind[_TF] + of_kind[_OLD_TF], of_kind[_ODOMETRY])
-    depth: set[str] = set()
-    photos: set[str] = set()
-    left_out: dict[str, str] = {}
-    for topic, first in _firsts(reader, of_kind[_IMAGE]):
-        if is_depth(first):
-            depth.add(topic)
-        elif has_known_colors(first):
-            photos.add(topic)
-        else:
-            left_out[topic] = first.encoding
+    unstamped: set[str] = set()
+    tf = of_kind[_TF] + of_kind[_OLD_TF]
+    transforms = _transforms(reader, tf, of_kind[_ODOMETRY], unstamped)
+    firsts = dict(_firsts(reader, of_kind[_IMAGE] + of_kind[_COMPRESSED]))
+    compressed = {topic for topic, first in firsts.items() if hasattr(first, "format")}
+    depth = {t for t in firsts.keys() - compressed if is_depth(firsts[t], t)}
+    photos = {t for t in firsts.keys() - compressed - depth if has_known_colors(firsts[t])}
+    left_out = {
+        topic: f"its encoding {firsts[topic].encoding!r} is not supported"
+        + " unless its name says depth" * (firsts[topic].encoding == "mono16")
+        for topic in firsts.keys() - compressed - depth - photos
+    }
     # What is compressed as depth has a header of its own before the file.
-    compressed = {each.topic for each in of_kind[_COMPRESSED] if "depth" not in each.topic.lower()}
-    photos |= {topic for topic in compressed if _base_topic(topic) not in photos}
+    packed = {topic for topic in compressed if "depth" in topic.lower()}
+    left_out |= dict.fromkeys(packed, "compressed depth is not read")
+    photos |= {topic for topic in compressed - packed if _base_topic(topic) not in photos}
     infos = dict(_firsts(reader, of_kind[_INFO]))
-    cameras = {topic: _camera(infos, topic) for topic in photos | depth}
-    names = tuple(sorted(photos)), tuple(sorted(depth))
+    frames = {topic: _frame(firsts[topic].header.frame_id) for topic in sorted(photos | depth)}
+    info_of, notes = _infos_of(infos, frames)
+    cameras: dict[str, Camera | None] = {}
+    for topic in frames:
+        try:
+            cameras[topic] = _camera(infos, info_of.get(topic), topic)
+        except VislocError as error:
+            left_out[topic] = f"{error.message} ({error.got})"
+    names = tuple(t for t in cameras if t in photos), tuple(t for t in cameras if t in depth)
     tables = MappingProxyType(left_out), MappingProxyType(cameras)
-    return Bag(path, *names, *tables, transforms, reader)
+    cropped = frozenset(each for each, info in info_of.items() if is_cropped(infos[info]))
+    return Bag(path, *names, *tables, cropped, notes, unstamped, transforms, reader)
 
 
 def _base_topic(topic: str) -> str:
@@ -150,19 +170,44 @@ def _base_topic(topic: str) -> str:
     return base if transport in ("compressed", "compressedDepth") else topic
 
 
-def _camera(infos: Mapping[str, Any], topic: str) -> Camera | None:
-    """Return the camera of a topic, which is published beside it by the transports' convention."""
-    parent, _, name = _base_topic(topic).rpartition("/")
-    info_topic = f"{parent}/camera_info"
-    if info_topic not in infos:
+def _infos_of(
+    infos: Mapping[str, Any], frames: Mapping[str, str]
+) -> tuple[dict[str, str], tuple[str, ...]]:
+    """Return the ``camera_info`` of topics of pictures, whose frames are given, and notes.
+
+    It is published beside the pictures by the transports' convention, or under them; else it is
+    the only one of their frame that no other pictures have.
+    """
+    found: dict[str, str] = {}
+    for topic in frames:
+        base = _base_topic(topic)
+        for beside in (f"{base.rpartition('/')[0]}/camera_info", f"{base}/camera_info"):
+            if beside in infos:
+                found.setdefault(topic, beside)
+    free = {name: _frame(infos[name].header.frame_id) for name in infos.keys() - found.values()}
+    notes = []
+    for topic, frame in frames.items():
+        alike = [name for name, of_info in free.items() if frame and of_info == frame]
+        if topic not in found and len(alike) == 1:
+            found[topic] = alike[0]
+            notes.append(f"{topic}: its camera is that of {alike[0]}, which is of the same frame")
+    unused = sorted(infos.keys() - found.values())
+    notes += [f"{name}: not used, no topic of pictures is clearly of its camera" for name in unused]
+    return found, tuple(notes)
+
+
+def _camera(infos: Mapping[str, Any], info_topic: str | None, topic: str) -> Camera | None:
+    if info_topic is None:
         return None
-    rectified = name.startswith("image_rect")
+    rectified = _base_topic(topic).rpartition("/")[2].startswith("image_rect")
     return camera_from_info(infos[info_topic], info_topic, rectified=rectified)
 
 
-def _transforms(reader: Any, tf: Sequence[Any], odometry: Sequence[Any]) -> Transforms:
+def _transforms(
+    reader: Any, tf: Sequence[Any], odometry: Sequence[Any], unstamped: set[str]
+) -> Transforms:
     found = Transforms()
-    for topic, message in _decoded(reader, tf) if tf else ():
+    for topic, message in _decoded(reader, tf, unstamped) if tf else ():
         for each in message.transforms:
             moved = each.transform
             time_ns = None if topic.endswith("tf_static") else _stamp(each)
@@ -175,7 +220,7 @@ def _transforms(reader: Any, tf: Sequence[Any], odometry: Sequence[Any]) -> Tran
         child = _frame(message.child_frame_id)
         if not found.knows(child):
             told_by.setdefault(child, topic)
-    for topic, message in _decoded(reader, odometry) if told_by else ():
+    for topic, message in _decoded(reader, odometry, unstamped) if told_by else ():
         child = _frame(message.child_frame_id)
         if told_by.get(child) == topic:
             at, parent = message.pose.pose, _frame(message.header.frame_id)
@@ -198,14 +243,22 @@ def _add(
 
 def _firsts(reader: Any, connections: Sequence[Any]) -> Iterator[tuple[str, Any]]:
     for connection in connections:
-        first = next(_decoded(reader, [connection]), None)
+        first = next(_decoded(reader, [connection], set()), None)
         if first is not None:
             yield first
 
 
-def _decoded(reader: Any, connections: Sequence[Any]) -> Iterator[tuple[str, Any]]:
-    for connection, _, raw in reader.messages(connections):
-        yield connection.topic, reader.deserialize(raw, connection.msgtype)
+def _decoded(
+    reader: Any, connections: Sequence[Any], unstamped: set[str]
+) -> Iterator[tuple[str, Any]]:
+    """Decode messages; those without a stamp get that of their arrival, and are told of."""
+    for connection, arrival, raw in reader.messages(connections):
+        message = reader.deserialize(raw, connection.msgtype)
+        for each in getattr(message, "transforms", (message,)):
+            if _stamp(each) == 0:  # as simulators without a clock write
+                unstamped.add(connection.topic)
+                each.header.stamp.sec, each.header.stamp.nanosec = divmod(arrival, _PER_SECOND)
+        yield connection.topic, message
 
 
 def _frame(name: str) -> str:

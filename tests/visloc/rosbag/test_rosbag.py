@@ -90,11 +90,21 @@ def test_a_circle_of_frames_ends() -> None:
 # Cameras
 
 
-def info(model: str, d: list[float], width: int = 640, height: int = 480) -> Any:
+def info(
+    model: str,
+    d: list[float],
+    width: int = 640,
+    height: int = 480,
+    roi: tuple[int, int, int, int] = (0, 0, 0, 0),
+    binning: tuple[int, int] = (0, 0),
+) -> Any:
     k = np.array([500.0, 0, 319.5, 0, 510, 239.5, 0, 0, 1])
     p = np.array([450.0, 0, 310.5, -40, 0, 460, 229.5, 0, 0, 0, 1, 0])
+    names = "x_offset", "y_offset", "width", "height"
     return SimpleNamespace(
-        width=width, height=height, distortion_model=model, k=k, d=np.array(d), p=p
+        **{"width": width, "height": height, "distortion_model": model},
+        **{"k": k, "d": np.array(d), "p": p, "binning_x": binning[0], "binning_y": binning[1]},
+        roi=SimpleNamespace(**dict(zip(names, roi, strict=True))),
     )
 
 
@@ -115,6 +125,30 @@ def test_cameras_count_pixels_from_the_corner() -> None:
             "FULL_OPENCV",
         ),
         ("equidistant", [0.1, -0.05, 0.001, 0.002], "OPENCV_FISHEYE"),
+        # Zeros at the end, or too few numbers.
+        ("plumb_bob", [0.1, -0.05, 0.001, 0.002], "OPENCV"),
+        ("plumb_bob", [0.1, -0.05], "OPENCV"),
+        ("plumb_bob", [0.1, -0.05, 0.001, 0.002, 0.01, 0.0, 0.0, 0.0], "FULL_OPENCV"),
+        ("plumb_bob", [0.1, -0.05, 0.001, 0.002, 0.0, 0.0, 0.0, 0.0], "OPENCV"),
+        ("plumb_bob", [0.1, -0.05, 0.001, 0.002, 0.01, 0.02, 0.003, 0.004], "FULL_OPENCV"),
+        ("rational_polynomial", [0.1, -0.05, 0.001, 0.002], "OPENCV"),
+        ("rational_polynomial", [0.1, -0.05, 0.001, 0.002, 0.0], "OPENCV"),
+        ("rational_polynomial", [0.1, -0.05, 0.001, 0.002, 0.01], "FULL_OPENCV"),
+        ("rational_polynomial", [0.1, -0.05, 0.001, 0.002, *[0.0] * 4], "OPENCV"),
+        (
+            "rational_polynomial",
+            [4.6, 1.3, 1e-4, -2e-4, 0.5, 4.5, 1.2, 0.4, *[0.0] * 4],
+            "FULL_OPENCV",
+        ),
+        (
+            "rational_polynomial",
+            [4.6, 1.3, 1e-4, -2e-4, 0.5, 4.5, 1.2, 0.4, *[0.0] * 6],
+            "FULL_OPENCV",
+        ),
+        ("equidistant", [-0.0022, 0.0376, -0.0364, 0.0059, 0.0], "OPENCV_FISHEYE"),
+        ("equidistant", [0.1, -0.05, 0.0, 0.0], "OPENCV_FISHEYE"),
+        ("equidistant", [0.0, 0.0, 0.0, 0.0], "OPENCV_FISHEYE"),
+        ("fisheye", [0.1, -0.05, *[0.0] * 6], "OPENCV_FISHEYE"),
     ],
 )
 def test_distortion_is_that_of_opencv(model: str, d: list[float], ours: str) -> None:
@@ -125,18 +159,65 @@ def test_distortion_is_that_of_opencv(model: str, d: list[float], ours: str) -> 
     assert camera.model == ours
     points = np.array([[0.3, -0.2, 1.0], [-0.1, 0.25, 1.2]])
     k = info(model, d).k.reshape(3, 3)
-    if model == "equidistant":
+    if ours == "OPENCV_FISHEYE":
+        d = [*d, 0.0, 0.0][:4]
         expected, _ = cv2.fisheye.projectPoints(
             points[:, None], np.zeros(3), np.zeros(3), k, np.array(d)
+        )
+    elif len(d) == 2:
+        expected, _ = cv2.projectPoints(
+            points, np.zeros(3), np.zeros(3), k, np.array([*d, 0.0, 0.0])
         )
     else:
         expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), k, np.array(d))
     np.testing.assert_allclose(project(camera, points), expected.reshape(-1, 2) + 0.5, atol=1e-6)
 
 
-def test_an_unknown_model_is_named_and_no_calibration_is_no_camera() -> None:
-    with pytest.raises(DatasetError, match=r"'fov' with 1 numbers"):
-        camera_from_info(info("fov", [0.9]), "/c")
+@pytest.mark.parametrize(
+    ("changes", "got"),
+    [
+        ({"model": "fov", "d": [0.9]}, "'fov' with 1 numbers"),
+        ({"model": "", "d": [0.1, 0.1, 0.0, 0.0, 0.0]}, "'' with 2 numbers"),
+        ({"model": "omni", "d": [1.0, 2.0, 3.0, 4.0, 5.0]}, "'omni' with 5 numbers"),
+        ({"model": "equidistant", "d": [0.1, 0.1, 0.1, 0.1, 0.1]}, "with 5 numbers"),
+        # A thin prism, a tilted sensor.
+        ({"model": "rational_polynomial", "d": [0.1] * 9}, "with 9 numbers"),
+        ({"model": "rational_polynomial", "d": [*[0.0] * 13, 0.01]}, "with 14 numbers"),
+        ({"roi": (400, 0, 320, 240)}, "320 x 240 at 400, 0"),
+        ({"roi": (0, 300, 0, 240)}, "640 x 240 at 0, 300"),
+    ],
+)
+def test_a_camera_that_we_lack_is_named(changes: dict[str, Any], got: str) -> None:
+    with pytest.raises(DatasetError) as caught:
+        camera_from_info(info(**{"model": "plumb_bob", "d": [0.0] * 5, **changes}), "/c")
+    assert (caught.value.code, caught.value.field) == ("bag.camera", "/c")
+    assert got in str(caught.value.got)
+
+
+@pytest.mark.parametrize(
+    ("roi", "binning", "size", "k"),
+    [
+        ((0, 0, 0, 0), (1, 1), (640, 480), (500, 510, 320, 240)),
+        ((0, 0, 640, 480), (0, 0), (640, 480), (500, 510, 320, 240)),
+        ((0, 0, 0, 0), (2, 2), (320, 240), (250, 255, 160, 120)),
+        ((0, 0, 0, 0), (2, 1), (320, 480), (250, 510, 160, 240)),
+        ((160, 120, 320, 240), (1, 1), (320, 240), (500, 510, 160, 120)),
+        ((100, 20, 400, 300), (2, 2), (200, 150), (250, 255, 110, 110)),
+    ],
+)
+def test_a_camera_is_of_the_region_that_is_read_and_binned(
+    roi: tuple[int, int, int, int],
+    binning: tuple[int, int],
+    size: tuple[int, int],
+    k: tuple[float, ...],
+) -> None:
+    for rectified in (False, True):
+        given = info("plumb_bob", [0.0] * 5, roi=roi, binning=binning)
+        given.p = np.column_stack([given.k.reshape(3, 3), np.zeros(3)]).reshape(-1)
+        assert camera_from_info(given, "/c", rectified=rectified) == Camera("PINHOLE", *size, k)
+
+
+def test_no_calibration_is_no_camera() -> None:
     uncalibrated = info("plumb_bob", [])
     uncalibrated.k = np.zeros(9)
     assert camera_from_info(uncalibrated, "/c") is None
@@ -328,7 +409,7 @@ def test_each_photo_comes_once_and_an_encoding_that_we_lack_is_told(
 
     with open_bag(tmp_path / "x.bag" if made.ros1 else tmp_path / "x") as bag:
         assert bag.photos == ("/left/image_raw", "/right/image_raw/compressed")
-        assert bag.left_out == {"/right/image_raw": "bayer_rggb8"}
+        assert bag.left_out == {"/right/image_raw": "its encoding 'bayer_rggb8' is not supported"}
         assert [picture.topic for picture in bag.pictures(bag.photos)] == list(bag.photos)
 
 
@@ -366,6 +447,20 @@ def test_of_two_odometries_one_counts(made: Made, tmp_path: Path) -> None:
     assert found is not None
     assert beside is not None
     np.testing.assert_allclose([found.translation[0], beside.translation[0]], [2, 2.5])
+
+
+@pytest.mark.parametrize("name", ["x/x.db3", "x/metadata.yaml", "x.active", "x"])
+def test_a_bag_that_was_cut_off_says_how_to_repair_it(tmp_path: Path, name: str) -> None:
+    (tmp_path / "x").mkdir()
+    for each in ("x/x.db3", "x.active", *[name] * (name != "x")):
+        (tmp_path / each).write_bytes(b"SQLite format 3\0")
+
+    with pytest.raises(DatasetError) as caught, open_bag(tmp_path / name):
+        pass
+    assert caught.value.code == "bag.unreadable"
+    assert caught.value.field == str(tmp_path / name)
+    assert "ros2 bag reindex" in str(caught.value.expected)
+    assert "is no .bag" in str(caught.value.got) or "without metadata.yaml" in str(caught.value.got)
 
 
 def test_ros_1_bags_may_be_compressed(tmp_path: Path) -> None:
