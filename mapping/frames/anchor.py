@@ -113,7 +113,7 @@ def known_positions(dataset: Dataset, photos: Sequence[MappingPhoto]) -> KnownPo
             Anchor(kind="gnss", images=len(rows)), np.array(rows), xyz, GNSS_ERROR_M
         )
     geodetic = xyz[:, [1, 0, 2]]
-    check_on_earth(geodetic, fixes_file(dataset))
+    check_on_earth(geodetic, str(dataset.root / "sensors" / "records_gnss.txt"))
     origin = middle_of(geodetic)
     anchor = Anchor(kind="gnss", images=len(rows), geodetic=_at(origin))
     return KnownPositions(anchor, np.array(rows), enu_from_geodetic(geodetic, origin), GNSS_ERROR_M)
@@ -122,11 +122,7 @@ def known_positions(dataset: Dataset, photos: Sequence[MappingPhoto]) -> KnownPo
 def about_fixes(
     known: KnownPositions, rows: NDArray[np.int64]
 ) -> tuple[KnownPositions, Similarity]:
-    """Move the origin of fixes in degrees amid those of some rows of the positions.
-
-    Returns:
-        The positions about that origin, and what takes the world that they were in to the new one.
-    """
+    """Move the origin of fixes in degrees amid those of some rows; return also new_from_old."""
     old = known.anchor.geodetic
     if old is None:
         return known, Similarity.identity()
@@ -139,22 +135,12 @@ def about_fixes(
 def spread_of(positions: NDArray[np.float64]) -> float:
     """Return how far positions (n, 3) extend from their median, without far strays."""
     away = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
-    if not away.any():
-        return 0.0
-    return float(away[away <= _STRAY * np.median(away[away > 0])].max())
-
-
-def fixes_file(dataset: Dataset) -> str:
-    """Return the file of a dataset's GNSS fixes, for errors."""
-    return str(dataset.root / "sensors" / "records_gnss.txt")
+    moved = away[away > 0]
+    return float(moved[moved <= _STRAY * np.median(moved)].max()) if len(moved) else 0.0
 
 
 def check_on_earth(positions: NDArray[np.float64], field: str) -> None:
-    """Refuse positions (n, 3) that are not latitude, longitude (deg) and height (m).
-
-    Raises:
-        InvalidInput: ``anchor.position`` with the first that is not.
-    """
+    """Raise ``anchor.position`` unless (n, 3) are latitude, longitude (deg) and height (m)."""
     latitude, longitude, height = positions.T
     # NaN fails too.
     fine = (np.abs(latitude) <= 90) & (np.abs(longitude) <= 180) & (np.abs(height) <= 100_000)

@@ -23,7 +23,6 @@ from mapping.frames.anchor import (
     align_positions,
     check_on_earth,
     coordinate_system,
-    fixes_file,
     spread_of,
 )
 from mapping.frames.anchor_error import place_error
@@ -113,7 +112,7 @@ def correspondences_from_fixes(opened: Map, dataset: Dataset) -> Correspondences
             got=system,
         )
     positions = np.array([[fix.y, fix.x, fix.z] for _, fix in found])
-    check_on_earth(positions, fixes_file(dataset))
+    check_on_earth(positions, str(dataset.root / "sensors" / "records_gnss.txt"))
     rows = [row for row, _ in found]
     return Correspondences(
         "gnss",

@@ -45,8 +45,8 @@ class _Topic:
         sensor: its id in the dataset, and the folder of its photos.
         last: the photo that was taken last: its time, and ``world_from_cam``.
         camera: of photos of ``size``; None where the bag does not say.
-        wrong: why its photos are left out after all.
-        depth_camera: of the depth that the photos have.
+        wrong: why its photos are left out after all; None for others.
+        depth_camera: of the depth that the photos have; None without.
     """
 
     name: str
@@ -278,11 +278,7 @@ def _model(
 
 
 def _fitted(bag: Bag, topic: str, size: tuple[int, int]) -> Camera | None:
-    """Return the camera of a topic whose pictures are of a size; None where the bag does not say.
-
-    Raises:
-        DatasetError: ``bag.camera`` for pictures that do not show all that the camera does.
-    """
+    """Return the camera of pictures of a size, None where the bag does not say, or refuse it."""
     camera = bag.cameras[topic]
     if camera is None or (camera.width, camera.height) == size:
         return camera

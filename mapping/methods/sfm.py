@@ -17,7 +17,6 @@ from pydantic import JsonValue
 
 from mapping.frames.anchor import (
     MAX_SCALE_ERROR,
-    KnownPositions,
     about_fixes,
     align_positions,
     at_own_scale,
@@ -426,7 +425,12 @@ def _anchored(
         )
         return *free, (note,), ()
     similarity, agrees = found
-    notes = _on_unused(known, placed, similarity.apply(centers), photos, agrees)
+    off = np.linalg.norm(similarity.apply(centers) - positions, axis=1)
+    wrong = [row for row in np.argsort(-off) if not agrees[row]]
+    names = some([f"{photos[known.photos[placed[i]]].name} ({off[i]:.3g} off)" for i in wrong])
+    unused = f"{len(wrong)} of {len(placed)} known positions ({known.anchor.kind}) contradict the "
+    unused += f"others by more than {known.max_error:.3g} and are not used: {names}"
+    notes = (unused,) if wrong else ()
     known, moved = about_fixes(known, placed[agrees])
     similarity = moved @ similarity
     centers, positions = centers[agrees], known.positions[placed[agrees]]
@@ -444,25 +448,6 @@ def _anchored(
         geodetic = anchor.geodetic.model_copy(update={"error": error})
         anchor = anchor.model_copy(update={"geodetic": geodetic})
     return similarity, anchor, notes, doubts
-
-
-def _on_unused(
-    known: KnownPositions,
-    rows: NDArray[np.int64],
-    aligned: NDArray[np.float64],
-    photos: Sequence[MappingPhoto],
-    agrees: NDArray[np.bool_],
-) -> tuple[str, ...]:
-    """Return a note on known positions that the others contradict, the furthest off first."""
-    off = np.linalg.norm(aligned - known.positions[rows], axis=1)
-    wrong = [row for row in np.argsort(-off, kind="stable") if not agrees[row]]
-    if not wrong:
-        return ()
-    names = some([f"{photos[known.photos[rows[row]]].name} ({off[row]:.3g} off)" for row in wrong])
-    return (
-        f"{len(wrong)} of {len(rows)} known positions ({known.anchor.kind}) contradict the others "
-        f"by more than {known.max_error:.3g} and are not used: {names}",
-    )
 
 
 def _on_unit(

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from visloc.errors import refuse
 from visloc.geometry import Camera
@@ -50,23 +49,22 @@ def camera_from_info(info: Any, topic: str, *, rectified: bool = False) -> Camer
         *(k[0, 0] / by_x, k[1, 1] / by_y),
         *((k[0, 2] + _CORNER - left) / by_x, (k[1, 2] + _CORNER - top) / by_y),
     )
-    size = wide // by_x, high // by_y
     model, numbers = info.distortion_model, np.trim_zeros(d, "b")
-    fisheye = len(d) > 0 and model in ("equidistant", "fisheye")  # without distortion, too
-    if len(numbers) == 0 and not fisheye:
-        return Camera("PINHOLE", *size, pinhole)
-    if fisheye and len(numbers) <= 4:
-        return Camera("OPENCV_FISHEYE", *size, (*pinhole, *_padded(numbers, 4)))
-    if model in ("plumb_bob", "rational_polynomial") and len(numbers) <= 8:
-        if len(numbers) <= 4:
-            return Camera("OPENCV", *size, (*pinhole, *_padded(numbers, 4)))
-        return Camera("FULL_OPENCV", *size, (*pinhole, *_padded(numbers, 8)))
-    raise refuse(
-        "bag.camera",
-        field=topic,
-        expected="plumb_bob or rational_polynomial (up to 8 numbers) or equidistant (up to 4)",
-        got=f"{model!r} with {len(numbers)} numbers",
-    )
+    fits = {"PINHOLE": 0}
+    if model in ("plumb_bob", "rational_polynomial"):
+        fits |= {"OPENCV": 4, "FULL_OPENCV": 8}
+    elif model in ("equidistant", "fisheye") and len(d) > 0:  # without distortion, too
+        fits = {"OPENCV_FISHEYE": 4}
+    ours = next((each for each, most in fits.items() if len(numbers) <= most), None)
+    if ours is None:
+        raise refuse(
+            "bag.camera",
+            field=topic,
+            expected="plumb_bob or rational_polynomial (up to 8 numbers) or equidistant (up to 4)",
+            got=f"{model!r} with {len(numbers)} numbers",
+        )
+    distortion = np.pad(numbers, (0, fits[ours] - len(numbers))).tolist()
+    return Camera(ours, wide // by_x, high // by_y, (*pinhole, *distortion))
 
 
 def is_cropped(info: Any) -> bool:
@@ -79,7 +77,3 @@ def _region(info: Any) -> tuple[int, int, int, int]:
     roi = info.roi
     left, top = int(roi.x_offset), int(roi.y_offset)
     return left, top, int(roi.width) or info.width - left, int(roi.height) or info.height - top
-
-
-def _padded(numbers: NDArray[np.float64], length: int) -> tuple[float, ...]:
-    return (*numbers.tolist(), *[0.0] * (length - len(numbers)))
