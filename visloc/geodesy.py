@@ -63,8 +63,7 @@ def geodetic_from_enu(
 def middle_of(positions: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return a geodetic position (3,) amid others (n, 3), also across a pole or the 180th meridian.
 
-    Medians, so that fewer than half of the positions, however far away, do not move it out of the
-    others: of the metres from the centre of the Earth, and of the heights.
+    Fewer than half of them, however far away, do not move it out of the others.
     """
     middle = geodetic_from_ecef(np.median(ecef_from_geodetic(positions), axis=0)[None])[0]
     return np.array([*middle[:2], np.median(positions[:, 2])])

@@ -98,6 +98,8 @@ def bag(
     if failed:
         told = f"{len(failed)} photos, the first: [{failed[0].code}] {failed[0]}"
         print_line(_err, "no answer", told, "yellow")
+    for note in opened.notes():
+        print_line(_err, "note", note, "yellow")
     if not info.metric:
         print_line(_err, "unit", "of the map, which is not known to be a metre", "yellow")
     if not poses:
@@ -105,11 +107,11 @@ def bag(
 
 
 def _chosen(opened: Bag, topics: list[str] | None) -> tuple[str, ...]:
-    if not opened.photos:
-        raise refuse("bag.no_photos", field=str(opened.path))
+    opened.check_has_photos()
     unknown = [each for each in topics or () if each not in opened.photos]
     if unknown:
-        raise refuse("bag.topic", field="--topic", expected=opened.photos, got=unknown[0])
+        got = f"{unknown[0]}: {opened.left_out.get(unknown[0], 'no such topic')}"
+        raise refuse("bag.topic", field="--topic", expected=opened.photos, got=got)
     return tuple(topics) if topics else opened.photos
 
 

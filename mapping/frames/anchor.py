@@ -119,9 +119,7 @@ def known_positions(dataset: Dataset, photos: Sequence[MappingPhoto]) -> KnownPo
     return KnownPositions(anchor, np.array(rows), enu_from_geodetic(geodetic, origin), GNSS_ERROR_M)
 
 
-def about_fixes(
-    known: KnownPositions, rows: NDArray[np.int64]
-) -> tuple[KnownPositions, Similarity]:
+def about_rows(known: KnownPositions, rows: NDArray[np.int64]) -> tuple[KnownPositions, Similarity]:
     """Move the origin of fixes in degrees amid those of some rows; return also new_from_old."""
     old = known.anchor.geodetic
     if old is None:

@@ -373,7 +373,7 @@ def _degrees(value: object, letter: object, signs: Mapping[str, int], limit: flo
     while parts and parts[-1] is None:
         parts.pop()
     numbers = [number for number in parts if number is not None]
-    total = sum(number / 60**power for power, number in enumerate(numbers))
+    total = sum(number / 60.0**power for power, number in enumerate(numbers))
     if (
         not 1 <= len(parts) == len(numbers) <= 3
         or min(numbers) < 0

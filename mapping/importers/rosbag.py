@@ -77,10 +77,7 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
         Unavailable: ``bag.no_rosbags``.
     """
     with open_bag(path) as bag:
-        if not bag.photos:
-            others = dict.fromkeys(bag.depth, "depth") | dict(bag.left_out)
-            got = "; ".join(f"{topic}: {why}" for topic, why in sorted(others.items()))
-            raise refuse("bag.no_photos", field=str(path), got=got or None)
+        bag.check_has_photos()
         path = path.resolve()  # "." has no name
         folder = path.with_name(f"{path.stem}_photos") if photos is None else photos
         is_new = not folder.exists()
@@ -136,8 +133,7 @@ def _take(bag: Bag, topic: _Topic, picture: Picture, folder: Path) -> None:
     _write(folder / name, picture)
     try:
         size = photo_size(folder / name)
-        assert size is not None  # of what was just written
-        if topic.size is None:
+        if topic.size is None and size is not None:
             topic.camera, topic.size = _fitted(bag, topic.name, size), size
     except DatasetError as error:
         (folder / name).unlink()
@@ -222,15 +218,7 @@ def _model(
     bag: Bag, topics: list[_Topic], depth_topics: dict[str, str], folder: Path
 ) -> ImportedModel:
     sensors: dict[str, Sensor] = {}
-    notes = [
-        *(f"{topic}: left out, {why}" for topic, why in sorted(bag.left_out.items())),
-        *bag.notes,
-    ]
-    notes += [
-        f"{topic}: messages without a stamp (0) have their time of arrival, which is later"
-        for topic in sorted(bag.unstamped)
-        if not topic.endswith("tf_static")
-    ]
+    notes = bag.notes()
     unused = [topic for topic in bag.depth if topic not in depth_topics.values()]
     notes += [f"{topic}: depth left out, of no photo's frame, time and camera" for topic in unused]
     for topic in topics:
@@ -251,8 +239,8 @@ def _model(
             continue
         told = bag.cameras[topic.name]
         if told is not None and topic.camera != told:
-            of, to = (f"{w} x {h}" for w, h in ((told.width, told.height), topic.size))
-            notes.append(f"{topic.name}: its camera is of {of}, scaled to the photos' {to}")
+            size = f"{told.width} x {told.height}"
+            notes.append(f"{topic.name}: its camera, of {size}, is scaled to its photos")
         sensors[topic.sensor] = (
             Sensor(topic.sensor, "", "camera", (UNKNOWN_CAMERA, *map(str, topic.size)), None)
             if topic.camera is None

@@ -17,7 +17,7 @@ from pydantic import JsonValue
 
 from mapping.frames.anchor import (
     MAX_SCALE_ERROR,
-    about_fixes,
+    about_rows,
     align_positions,
     at_own_scale,
     known_positions,
@@ -431,7 +431,7 @@ def _anchored(
     unused = f"{len(wrong)} of {len(placed)} known positions ({known.anchor.kind}) contradict the "
     unused += f"others by more than {known.max_error:.3g} and are not used: {names}"
     notes = (unused,) if wrong else ()
-    known, moved = about_fixes(known, placed[agrees])
+    known, moved = about_rows(known, placed[agrees])
     similarity = moved @ similarity
     centers, positions = centers[agrees], known.positions[placed[agrees]]
     doubts: tuple[Doubt, ...] = ()

@@ -261,6 +261,8 @@ def test_one_broken_photo_of_a_bag_does_not_cost_the_others(
         ("/c/compressed", kind, second, made.file(second * SECOND, "camera", file))
         for second, file in ((1, b"no photo"), (2, good))
     ]
+    grey = made.image(SECOND, "thermal", np.zeros((4, 6), np.uint16), "mono16")
+    files.append(("/thermal", "sensor_msgs/msg/Image", SECOND, grey))
     write_messages(tmp_path / "bag", made, files)
     asked = ["bag", str(tmp_path / "bag"), "--map", "room", "--server", doors[0]]
 
@@ -271,11 +273,13 @@ def test_one_broken_photo_of_a_bag_does_not_cost_the_others(
     told = capsys.readouterr().err
     assert "1 of 2 photos localized" in told
     assert "no answer      1 photos, the first: [image." in told
+    assert "/thermal: left out, its encoding 'mono16' is not supported" in told
     for wrong, code in (
         (["--frame", "base_link"], "bag.frame"),
         (["--output", str(tmp_path / "no" / "poses")], "output.folder"),
         (["--output", str(tmp_path / "poses")], "bag.exists"),
-        (["--topic", "/d"], "bag.topic"),
+        (["--topic", "/d"], "/d: no such topic"),
+        (["--topic", "/thermal"], "/thermal: its encoding 'mono16'"),
     ):
         with pytest.raises(SystemExit) as ended:
             main([*asked, "--output", str(tmp_path / "other"), *wrong])

@@ -18,13 +18,11 @@ def camera_from_info(info: Any, topic: str, *, rectified: bool = False) -> Camer
     That of rectified pictures is P, without distortion. K and P are of the whole sensor: the
     pictures show its region of interest (``is_cropped``), binned.
 
-    ``plumb_bob`` and ``rational_polynomial`` are one model of OpenCV's, of up to 8 numbers; drivers
-    write either name. ``equidistant`` is its fisheye model, of 4 (REP 104 and
-    sensor_msgs/distortion_models). Zeros at the end mean nothing.
+    ``plumb_bob`` and ``rational_polynomial`` are OpenCV's model of up to 8 numbers, ``equidistant``
+    its fisheye model of 4 (sensor_msgs/distortion_models). Zeros at the end mean nothing.
 
     Raises:
-        DatasetError: ``bag.camera``: a distortion model that we lack, or a region beyond the
-            sensor; ``camera.*``.
+        DatasetError: ``bag.camera``: a model we lack, a region beyond the sensor; ``camera.*``.
     """
     k, d, p = (  # ROS 1 wrote them in capitals
         np.asarray(getattr(info, name.upper() if hasattr(info, name.upper()) else name), np.float64)

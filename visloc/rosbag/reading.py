@@ -34,7 +34,7 @@ class Bag:
             their camera.
         cameras: intrinsics by topic of photos or depth; None where the bag does not say.
         cropped: topics whose camera is of a part of the sensor, and of no other size of picture.
-        notes: what was assumed, and which ``camera_info`` was not used.
+        on_cameras: what was assumed of cameras, and which ``camera_info`` was not used.
         unstamped: topics of messages without a stamp, which have their time of arrival; grows
             while the bag is read.
         transforms: the frames of the bag.
@@ -46,10 +46,26 @@ class Bag:
     left_out: Mapping[str, str]
     cameras: Mapping[str, Camera | None]
     cropped: frozenset[str]
-    notes: tuple[str, ...]
+    on_cameras: tuple[str, ...]
     unstamped: set[str]
     transforms: Transforms
     _reader: Any
+
+    def check_has_photos(self) -> None:
+        """Raise ``bag.no_photos``, which says what the pictures are, if no topic holds photos."""
+        if not self.photos:
+            others = dict.fromkeys(self.depth, "depth") | dict(self.left_out)
+            got = "; ".join(f"{topic}: {why}" for topic, why in sorted(others.items()))
+            raise refuse("bag.no_photos", field=str(self.path), got=got or None)
+
+    def notes(self) -> list[str]:
+        """Return what was left out or assumed, as far as the bag was read."""
+        timed = "messages without a stamp (0) have their time of arrival, which is later"
+        return [
+            *(f"{topic}: left out, {why}" for topic, why in sorted(self.left_out.items())),
+            *self.on_cameras,
+            *(f"{each}: {timed}" for each in sorted(self.unstamped) if "tf_static" not in each),
+        ]
 
     def pictures(self, topics: Sequence[str]) -> Iterator[Picture]:
         """Read the photos of some topics, in the order of the bag.

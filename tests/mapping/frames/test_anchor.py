@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from mapping.frames.anchor import (
     Alignment,
-    about_fixes,
+    about_rows,
     align_poses,
     align_positions,
     at_own_scale,
@@ -257,7 +257,7 @@ def test_axes_point_east_north_and_up_at_the_fixes_that_agree(
     assert isinstance(found, Alignment)
     assert np.flatnonzero(~found.agrees).tolist() == sorted(wrong)
     rows = np.flatnonzero(found.agrees)
-    moved, from_old = about_fixes(known, rows)
+    moved, from_old = about_rows(known, rows)
     assert moved.anchor.geodetic is not None
     middle = origin_of(moved.anchor.geodetic)
     assert np.linalg.norm(enu_from_geodetic(middle[None], origin)) < 300
@@ -278,7 +278,7 @@ def test_the_origin_leaves_fixes_of_photos_that_were_not_placed() -> None:
     known = known_positions(*dataset_with_fixes(*[""] * 15, positions=fixes))
     assert known is not None
 
-    moved, _ = about_fixes(known, np.arange(10, 15))
+    moved, _ = about_rows(known, np.arange(10, 15))
 
     assert moved.anchor.geodetic is not None
     assert origin_of(moved.anchor.geodetic)[:2] == pytest.approx([47, 15], abs=1e-4)
