@@ -17,10 +17,20 @@ from visloc_api.words.answers import (
 )
 from visloc_api.words.answers import MapRef as MapVersion
 from visloc_api.words.geopose import GeoPose, GeoPoseYpr
-from visloc_api.words.maps import Anchor, GeoCircle, Geodetic, MapInfo, RigInfo, VersionInfo
+from visloc_api.words.maps import (
+    Anchor,
+    Doubt,
+    GeoCircle,
+    Geodetic,
+    MapInfo,
+    OwnTest,
+    RigInfo,
+    VersionInfo,
+)
 from visloc_api.words.maps import Tile as TileInfo
 from visloc_api.words.options import LocalizeOptions
 from visloc_api.words.poses import PoseEstimate, RigPose
+from visloc_api.words.scenes import MapCamera, MapImage, MapImages
 
 __all__ = [
     "Anchor",
@@ -29,6 +39,7 @@ __all__ = [
     "CameraUsed",
     "Client",
     "Debug",
+    "Doubt",
     "Features",
     "GeoCircle",
     "GeoPose",
@@ -42,12 +53,16 @@ __all__ = [
     "InstantResult",
     "LocalizeOptions",
     "LocalizeResult",
+    "MapCamera",
+    "MapImage",
+    "MapImages",
     "MapInfo",
     "MapVersion",
     "MaskedImage",
     "Near",
     "Odometry",
     "Orientation",
+    "OwnTest",
     "PoseEstimate",
     "PosePrior",
     "PoseSource",

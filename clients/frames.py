@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from enum import StrEnum
 
 import numpy as np
@@ -27,6 +28,10 @@ class Axes(StrEnum):
     UNITY = "unity"
 
 
+_UNKNOWN_UNIT = (
+    "the unit of this map has an unknown length, and that of the session is the metre: content is "
+    "placed in the wrong size. mapping edit --scale gives the map its size"
+)
 _UPRIGHT = np.diag([1.0, -1.0, -1.0, 1.0])  # camera axes: opencv from opengl, and back
 _MIRRORED = np.diag([1.0, 1.0, -1.0, 1.0])  # Unity's frames from right-handed ones, and back
 
@@ -57,6 +62,9 @@ def session_from_map(
 ) -> NDArray[np.float64]:
     """Return where the map lies in the session: what moves content of the map to its place.
 
+    Warns (``UserWarning``) of an answer whose unit has an unknown length: content that is placed by
+    it has the wrong size and distance.
+
     Args:
         session_from_camera: the device's own pose **when the photo was taken**, a 4 x 4 matrix for
             column vectors. The answer comes later, and the device has moved on.
@@ -69,6 +77,8 @@ def session_from_map(
     Raises:
         InvalidInput: ``frames.not_rigid``: ``session_from_camera`` is no rigid transform.
     """
+    if isinstance(pose, PoseEstimate) and pose.metric is False:
+        warnings.warn(_UNKNOWN_UNIT, stacklevel=2)
     device = np.asarray(session_from_camera, dtype=np.float64)
     _check_rigid(device)
     moved: NDArray[np.float64] = device @ np.linalg.inv(camera_matrix(pose, axes))

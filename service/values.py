@@ -166,6 +166,7 @@ class Localization:
         tile: of a set, ``id@version`` of the map in it that gave the answer.
         reach: how far that map's photos see, in units of the answer's frame (median).
         anchor_rms: rms error of the map's anchor on Earth, in its unit; 0 when unknown.
+        metric: whether the unit of that frame is the metre.
     """
 
     answer: InstantAnswer
@@ -177,6 +178,7 @@ class Localization:
     tile: str | None = None
     reach: float = 0.0
     anchor_rms: float = 0.0
+    metric: bool = False
 
     @property
     def place(self) -> PlaceAnswer:

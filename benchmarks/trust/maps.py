@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from mapping.build.build import build_map
-from mapping.build.pieces import pieces_of
 from mapping.build.settings import BuildSettings
 from mapping.maps.sets import publish_set
 from mapping.methods.sfm_settings import SfmSettings
@@ -111,7 +110,7 @@ def make_missing(places: Places, needed: set[str], tell: Callable[[str], None]) 
         refs = [
             ref
             for map_id in (*FLOOR_11, *VIDEOS)
-            for ref in (map_id, *pieces_of(places.store.open(map_id).manifest))
+            for ref in (map_id, *places.store.open(map_id).manifest.pieces)
         ]
         tiles = [
             (ref, Similarity(1.0, np.eye(3), np.array([APART * i, 0.0, 0.0])))

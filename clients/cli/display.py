@@ -36,20 +36,17 @@ _FILLED: Mapping[str, str] = {
 }
 _PERCENTILES = ("p50", "p75", "p90", "max")
 
-# For lengths in a world that is not known to be metric.
-UNKNOWN_UNIT = "units of the map"
 
-
-def unit_of(map_info: MapInfo) -> str:
+def unit_of(told: MapInfo | PoseEstimate | CoarsePose) -> str:
     """Return the unit of lengths in a map's world."""
-    return "m" if map_info.metric else UNKNOWN_UNIT
+    return "m" if told.metric else "units of the map"
 
 
-def print_result(console: Console, result: LocalizeResult, unit: str) -> None:
+def print_result(console: Console, result: LocalizeResult) -> None:
     """Print one answer, a line for each fact."""
     if result.pose is not None:
         print_line(console, "localized", f"in {result.map.id}@{result.map.version}", "bold green")
-        _print_pose(console, result.pose, unit)
+        _print_pose(console, result.pose)
         if result.geopose is not None:
             print_line(console, "on Earth", _on_earth(result.geopose))
     elif result.refusal is not None:
@@ -59,7 +56,7 @@ def print_result(console: Console, result: LocalizeResult, unit: str) -> None:
         _print_candidates(console, result.refusal.candidates)
     if result.coarse is not None:
         print_line(console, "coarse", "told by retrieval alone; nothing confirms it", "bold yellow")
-        _print_place(console, result.coarse, unit)
+        _print_place(console, result.coarse)
     if result.tile is not None:
         print_line(console, "tile", result.tile)
     print_line(
@@ -156,11 +153,11 @@ def _on_earth(place: GeoPose) -> str:
     return f"{place.latitude:.8f}, {place.longitude:.8f}, {place.height:.3f} m above the ellipsoid"
 
 
-def _print_place(console: Console, pose: PoseEstimate | CoarsePose, unit: str) -> None:
+def _print_place(console: Console, pose: PoseEstimate | CoarsePose) -> None:
     print_line(
         console,
         "position",
-        f"{_numbers(pose.position, 4)} {unit}, std {_numbers(pose.position_std, 4)}",
+        f"{_numbers(pose.position, 4)} {unit_of(pose)}, std {_numbers(pose.position_std, 4)}",
     )
     print_line(
         console,
@@ -170,8 +167,8 @@ def _print_place(console: Console, pose: PoseEstimate | CoarsePose, unit: str) -
     )
 
 
-def _print_pose(console: Console, pose: PoseEstimate, unit: str) -> None:
-    _print_place(console, pose, unit)
+def _print_pose(console: Console, pose: PoseEstimate) -> None:
+    _print_place(console, pose)
     print_line(console, "uncertainty", _UNCERTAINTY.get(pose.uncertainty, pose.uncertainty))
     if pose.probability is not None:
         print_line(console, "probability", f"{pose.probability:.3f} that the pose is right")

@@ -14,12 +14,11 @@ from rich.console import Console
 from clients.cli.bag import bag
 from clients.cli.compare import compare
 from clients.cli.dataset import benchmark, localize_batch
-from clients.cli.display import UNKNOWN_UNIT, print_line, print_result, unit_of
+from clients.cli.display import print_line, print_result
 from clients.cli.evaluate import evaluate, submit
 from clients.cli.maps import maps_app
 from clients.cli.options import Connection, MapRef, QueryOptions, priors_from_text, spread
 from clients.cli.retrieve import retrieve
-from clients.client import Client
 from clients.errors import not_understood
 from clients.evaluation.results import check_can_be_written, write_whole
 from clients.wire.requests import read_image
@@ -106,7 +105,7 @@ def image(
         if as_json:
             typer.echo(json.dumps(result.raw, indent=2))
         else:
-            print_result(_out, result, _unit(client, f"{result.map.id}@{result.map.version}"))
+            print_result(_out, result)
     if debug is not None:
         if result.debug is None:
             got = "an answer without the picture that was asked for"
@@ -126,14 +125,6 @@ app.command()(bag)
 app.command()(evaluate)
 app.command()(submit)
 app.command()(retrieve)
-
-
-def _unit(client: Client, map_ref: str) -> str:
-    try:
-        return unit_of(client.map(map_ref))
-    except VislocError as error:  # the pose is known already, and worth more than its unit
-        print_line(_err, "unit unknown", f"[{error.code}] {error}", "yellow")
-        return UNKNOWN_UNIT
 
 
 def _fail(code: str, message: str) -> NoReturn:

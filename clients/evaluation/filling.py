@@ -91,6 +91,7 @@ def photo_result(result: InstantResult, index: int) -> LocalizeResult:
             "cam_from_world": raw["cam_from_world"],
             "photo_covariance": [] if photo is None else (turn @ photo @ turn.T).ravel().tolist(),
             "probability": result.pose.probability,
+            "metric": result.pose.metric,
         }
     elif result.localized:
         status = "not_localized"

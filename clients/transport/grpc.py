@@ -27,6 +27,7 @@ from clients.transport.uploads import OnProgress, Upload, pieces
 from clients.wire.requests import (
     CheckReady,
     DeleteVersion,
+    GetImages,
     GetMap,
     GetServer,
     GetVersion,
@@ -191,6 +192,9 @@ def _encode(request: Request) -> tuple[str, bytes, _Decode]:
         case GetMap():
             message = wire.GetMapRequest(map=request.map).SerializeToString()
             return f"{_SERVICE}/GetMap", message, _reads(wire.MapInfo)
+        case GetImages():
+            asked = wire.GetImagesRequest(map=request.map, first=request.first, count=request.count)
+            return f"{_SERVICE}/GetImages", asked.SerializeToString(), _reads(wire.MapImages)
         case GetVersion():
             return f"{_MAPS}/GetVersion", _version_message(request), _reads(wire.MapInfo)
         case UseVersion():

@@ -13,6 +13,7 @@ from clients.transport.uploads import Upload
 from clients.wire.requests import (
     CheckReady,
     DeleteVersion,
+    GetImages,
     GetMap,
     GetServer,
     GetVersion,
@@ -48,6 +49,9 @@ def _encode(request: Request, timeout_s: float) -> tuple[str, str, dict[str, Any
             return "GET", "/maps", {} if request.near is None else {"params": _near(request.near)}
         case GetMap():
             return "GET", f"/maps/{request.map}", {}
+        case GetImages():
+            params = {"first": request.first, "count": request.count}
+            return "GET", f"/maps/{request.map}/images", {"params": params}
         case GetVersion():
             return "GET", _version_path(request.map_id, request.version), {}
         case UseVersion():

@@ -62,7 +62,9 @@ def _plain_field(message: Message, field: Any) -> Any:  # a FieldDescriptor
     if field.is_repeated:
         kind = field.message_type
         if kind is not None and kind.GetOptions().map_entry:
-            return dict(value)  # every map of an answer has numbers as values
+            return {
+                key: plain(one) if isinstance(one, Message) else one for key, one in value.items()
+            }
         return [plain(item) for item in value] if kind is not None else list(value)
     if isinstance(value, bytes):
         return base64.b64encode(value).decode()

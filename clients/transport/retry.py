@@ -9,6 +9,7 @@ import httpx
 from clients.transport.uploads import Upload
 from clients.wire.requests import (
     DeleteVersion,
+    GetImages,
     GetMap,
     GetVersion,
     Localize,
@@ -20,6 +21,7 @@ from visloc_api.words.wire import MAP_HEADER
 
 # Before a request is sent a second time. Never a third: it may have ended both servers.
 RESEND_PAUSE_S = 0.1
+_RESENT = ("Localize", "LocalizeRig", "ListMaps", "GetMap", "GetImages")
 # gRPC retries by itself. Its servers answer INTERNAL when a request must not be sent again.
 GRPC_OPTIONS = (
     (
@@ -30,7 +32,7 @@ GRPC_OPTIONS = (
                     {
                         "name": [
                             {"service": "visloc.v1.Localization", "method": method}
-                            for method in ("Localize", "LocalizeRig", "ListMaps", "GetMap")
+                            for method in _RESENT
                         ]
                         + [{"service": "visloc.v1.Maps", "method": "GetVersion"}],
                         "retryPolicy": {
@@ -47,6 +49,8 @@ GRPC_OPTIONS = (
     ),
     # gRPC cannot resend a request that is larger than this buffer. The default is 256 KiB.
     ("grpc.per_rpc_retry_buffer_size", 128 * 2**20),
+    # Of an answer, such as the list of ten thousand maps. The default is 4 MiB.
+    ("grpc.max_receive_message_length", 128 * 2**20),
 )
 
 
@@ -57,7 +61,7 @@ def map_header(request: Request | StartSequence | Upload) -> dict[str, str]:
             if words.near is not None:
                 return {}
             name = words.map or (words.maps or [""])[0]
-        case GetMap():
+        case GetMap() | GetImages():
             name = request.map
         case GetVersion() | UseVersion() | DeleteVersion() | Upload():
             name = request.map_id

@@ -13,7 +13,6 @@ from pydantic import JsonValue
 from mapping.build.checks import check_settings, refuse_early
 from mapping.build.content import build_content
 from mapping.build.pieces import (
-    PIECES,
     WrittenMap,
     ids_of_pieces,
     note_of_largest,
@@ -57,7 +56,7 @@ from mapping.stages.publishing import PAIRS
 from mapping.stages.resolution import at_one_resolution
 from mapping.stages.work_folder import WorkFolder, exclusive
 from visloc.archive import GlobalFeatures, Map, MapStore
-from visloc.archive.schema import Doubt
+from visloc.archive.schema import PIECES, Doubt
 from visloc.errors import VislocError, refuse
 from visloc.features import check_local_features
 from visloc.features.backends.choice import choose_inference

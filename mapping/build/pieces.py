@@ -18,12 +18,9 @@ from pydantic import JsonValue
 from mapping.own_test.publishing import publish_tested
 from visloc.archive import MapStore
 from visloc.archive.checks import read_manifest
-from visloc.archive.schema import ID_PATTERN, Manifest
+from visloc.archive.schema import ID_PATTERN, PIECES, Manifest
 from visloc.errors import MapCorrupt, NotFound, refuse
 
-# In the settings of the largest piece, for the manifest; there also if it is the only one. Updates
-# and merges drop it: nothing tells which versions of the pieces belong to what they make.
-PIECES = "pieces"
 # As many digits fit behind the id.
 _LONGEST_SUFFIX = "-999"
 
@@ -84,12 +81,6 @@ def note_of_largest(pieces: Sequence[WrittenMap]) -> str:
     )
 
 
-def pieces_of(manifest: Manifest) -> list[str]:
-    """Return ``id@version`` of the other pieces of the build that made a map, largest first."""
-    pieces = manifest.method.settings.get(PIECES, [])
-    return [str(ref) for ref in pieces] if isinstance(pieces, list) else []
-
-
 def without_pieces(settings: Mapping[str, JsonValue]) -> dict[str, JsonValue]:
     """Return the settings of a method for a map that is not, or no more, as a build made it."""
     return {name: value for name, value in settings.items() if name != PIECES}
@@ -111,7 +102,7 @@ def use_version(store: MapStore, map_id: str, version: str) -> list[str]:
     used: list[str] = []
     if isinstance(manifest, Manifest) and PIECES in manifest.method.settings:
         stale = set(_known_pieces(store, map_id))
-        for ref in pieces_of(manifest):
+        for ref in manifest.pieces:
             piece_id, _, piece_version = ref.partition("@")
             if not _is_piece(store, piece_id, map_id):
                 continue  # removed, or of another map

@@ -11,7 +11,6 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from mapping.build.pieces import pieces_of
 from mapping.capture.account import fates, film_again, verdict
 from mapping.capture.job import Captured, Outlook, capture_map
 from mapping.capture.picture import draw_walk
@@ -60,7 +59,7 @@ def capture(
     picture.parent.mkdir(parents=True, exist_ok=True)
     draw_walk(opened, trials, picture)
     store = MapStore(settings.maps_dir)
-    pieces = [store.open(ref) for ref in pieces_of(opened.manifest)]
+    pieces = [store.open(ref) for ref in opened.manifest.pieces]
     print_map(opened)
     print_pieces(store, opened)
     print_costs(OUT, costs.table())

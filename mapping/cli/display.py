@@ -13,7 +13,6 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from mapping.build.pieces import pieces_of
 from mapping.cluster.stage_timings import Spent, StageCost
 from mapping.frames.georeference import Georeference
 from mapping.frames.rig_calibration import OUTLIER_MULTIPLE, RigCalibration, Spread
@@ -152,7 +151,7 @@ def _sides(lengths: NDArray[np.float64]) -> str:
 
 def print_pieces(store: MapStore, largest: Map) -> None:
     """Print the maps that the same build made of photos that nothing links to the largest map."""
-    for ref in pieces_of(largest.manifest):
+    for ref in largest.manifest.pieces:
         print_map(store.open(ref))
         map_id, _, version = ref.partition("@")
         if map_id not in store.ids() or store.current_version(map_id) != version:

@@ -43,7 +43,7 @@ def localize_response(found: Localization, request_id: str) -> LocalizeResponse:
     return LocalizeResponse(
         request_id=request_id,
         status="localized" if pose is not None else "not_localized" if coarse is None else "coarse",
-        pose=None if pose is None else _pose_estimate(pose),
+        pose=None if pose is None else _pose_estimate(pose, found),
         refusal=None if refusal is None else _refusal(refusal),
         keypoints=evidence.num_keypoints,
         correspondences=evidence.num_correspondences,
@@ -58,7 +58,7 @@ def localize_response(found: Localization, request_id: str) -> LocalizeResponse:
         geopose_ypr=geopose_ypr,
         debug=None if found.debug is None else Debug.model_validate(found.debug),
         tile=found.tile,
-        coarse=None if coarse is None else _coarse_pose(coarse),
+        coarse=None if coarse is None else _coarse_pose(coarse, found),
     )
 
 
@@ -77,7 +77,7 @@ def instant_answer(found: Localization, request_id: str) -> InstantAnswer:
         if pose.source is PoseSource.ESTIMATED
         else "filled",
         source=None if pose is None else pose.source,
-        pose=None if pose is None else _rig_pose(pose),
+        pose=None if pose is None else _rig_pose(pose, found),
         refusal=None if answer.refusal is None else _refusal(answer.refusal),
         images=tuple(_image_answer(image, pose) for image in answer.images),
         correspondences=correspondences,
@@ -114,11 +114,13 @@ def _candidate(found: visloc.types.Candidate) -> Candidate:
     )
 
 
-def _pose_estimate(pose: visloc.types.RigPose) -> PoseEstimate:
-    return PoseEstimate.model_validate({"cam_from_world": pose.rig_from_world, **_uncertain(pose)})
+def _pose_estimate(pose: visloc.types.RigPose, found: Localization) -> PoseEstimate:
+    return PoseEstimate.model_validate(
+        {"cam_from_world": pose.rig_from_world, **_uncertain(pose, found)}
+    )
 
 
-def _coarse_pose(coarse: visloc.types.CoarsePose) -> CoarsePose:
+def _coarse_pose(coarse: visloc.types.CoarsePose, found: Localization) -> CoarsePose:
     pose = coarse.cam_from_world
     return CoarsePose(
         cam_from_world=pose,
@@ -128,14 +130,17 @@ def _coarse_pose(coarse: visloc.types.CoarsePose) -> CoarsePose:
         position_std=coarse.position_std,
         orientation_std_deg=np.degrees(coarse.orientation_std),
         method=coarse.method,
+        metric=found.metric,
     )
 
 
-def _rig_pose(pose: visloc.types.RigPose) -> RigPose:
-    return RigPose.model_validate({"rig_from_world": pose.rig_from_world, **_uncertain(pose)})
+def _rig_pose(pose: visloc.types.RigPose, found: Localization) -> RigPose:
+    return RigPose.model_validate(
+        {"rig_from_world": pose.rig_from_world, **_uncertain(pose, found)}
+    )
 
 
-def _uncertain(measured: visloc.types.RigPose) -> dict[str, Any]:
+def _uncertain(measured: visloc.types.RigPose, found: Localization) -> dict[str, Any]:
     pose = measured.rig_from_world
     return {
         "position": pose.center,
@@ -146,6 +151,7 @@ def _uncertain(measured: visloc.types.RigPose) -> dict[str, Any]:
         "photo_covariance": measured.photo_covariance,
         "uncertainty": measured.uncertainty.value,
         "probability": measured.probability,
+        "metric": found.metric,
     }
 
 

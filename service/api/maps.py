@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from itertools import islice
 from typing import Any
 
 import visloc.archive
@@ -10,7 +11,7 @@ from service.values import ServedMap
 from visloc.archive import MapOutline, SetOutline
 from visloc.archive.photos import MappingPhotos
 from visloc_api.words.answers import MapRef
-from visloc_api.words.maps import MapInfo
+from visloc_api.words.maps import MAX_LISTED, MapInfo
 from visloc_api.words.scenes import MapCamera, MapImage, MapImages
 
 # Answers state it where they state an accuracy (``visloc.geopose``).
@@ -75,6 +76,11 @@ def _map_facts(outline: MapOutline) -> dict[str, Any]:
         "rigs": [{"id": id_, "sensors": tuple(sensors)} for id_, sensors in outline.rigs.items()],
         "fusion": manifest.retrieval.fusion.value,
         "fusion_weights": manifest.retrieval.weights or {},
+        "own_test": manifest.parts.own_test,
+        "doubts": manifest.parts.doubts[:MAX_LISTED],
+        "pieces": manifest.pieces[:MAX_LISTED],
+        "cameras": dict(islice(sorted(outline.cameras.items()), MAX_LISTED)),
+        "num_cameras": len(outline.cameras),
     }
 
 

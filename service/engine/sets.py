@@ -347,6 +347,7 @@ def in_set(found: Localization, outline: SetOutline, tile: TileRecord) -> Locali
         tile=tile.ref,
         reach=tile.reach,
         anchor_rms=anchor_rms(outline.manifest.world),
+        metric=outline.manifest.world.metric,
     )
 
 

@@ -45,6 +45,7 @@ class Target:
             ypr,
             reach=self.localizer.geometry.reach,
             anchor_rms=anchor_rms(opened.manifest.world),
+            metric=opened.manifest.world.metric,
         )
 
     def look(

@@ -71,6 +71,7 @@ POSE: dict[str, Any] = {
     "photo_covariance": [1e-10 / (i + j + 1) for i in range(6) for j in range(6)],
     "uncertainty": "whole",
     "probability": 1 / 3,
+    "metric": True,
 }
 GEOPOSE: dict[str, Any] = {
     "position": {"lat": 48.25, "lon": -122.1, "h": 1 / 3},

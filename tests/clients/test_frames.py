@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from clients import Axes, blended, camera_matrix, session_from_map
+from clients import Axes, PoseEstimate, blended, camera_matrix, session_from_map
+from service.http.openapi import example
 from visloc.errors import InvalidInput
 from visloc.geometry import Pose, rotation_angle
 
@@ -178,3 +180,20 @@ def test_what_is_no_rigid_transform_is_refused(matrix: Matrix) -> None:
     assert error.value.code == "frames.not_rigid"
     with pytest.raises(InvalidInput, match="rigid"):
         blended(np.eye(4), matrix, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("metric", "warned"), [(True, False), (False, True), (None, False), ("a pose", False)]
+)
+def test_a_session_is_warned_of_a_unit_of_unknown_length(metric: Any, warned: bool) -> None:
+    answer = example("localized")["pose"]
+    pose = PoseEstimate.model_validate(answer | {"metric": None if metric == "a pose" else metric})
+    asked = pose.cam_from_world if metric == "a pose" else pose
+
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        session_from_map(np.eye(4), asked, Axes.OPENGL)
+
+    assert [str(each.message).partition(" has")[0] for each in told] == (
+        ["the unit of this map"] if warned else []
+    )

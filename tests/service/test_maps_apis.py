@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from clients import AsyncClient, Client, Near
+from clients import AsyncClient, Axes, Client, Near, session_from_map
 from clients.cli.main import main
 from tests.conftest import Query
 from visloc.archive import MapStore
@@ -43,7 +43,12 @@ def pack(built_maps: Path, tmp_path_factory: pytest.TempPathFactory) -> Pack:
     """Pack a map that is equal to ``room`` but for its names."""
     folder = tmp_path_factory.mktemp("packed")
 
-    def make(version: str, map_id: str = "room", at: tuple[float, float] | None = None) -> Path:
+    def make(
+        version: str,
+        map_id: str = "room",
+        at: tuple[float, float] | None = None,
+        change: Callable[[Any], None] = lambda _: None,
+    ) -> Path:
         target = folder / f"{map_id}@{version}.zip"
         if not target.exists():
             copied = folder / "map"
@@ -54,6 +59,7 @@ def pack(built_maps: Path, tmp_path_factory: pytest.TempPathFactory) -> Pack:
                 geodetic = {"latitude_deg": at[0], "longitude_deg": at[1], "altitude_m": 500.0}
                 manifest["world"]["anchor"]["geodetic"] = geodetic
                 manifest["content_hash"] = content_hash(manifest)
+            change(manifest)
             manifest["manifest_hash"] = manifest_hash(manifest)
             (copied / "manifest.json").write_text(json_text(manifest))
             pack_map(copied, target)
@@ -174,6 +180,89 @@ def test_both_doors_describe_a_version_alike(doors: Any) -> None:
     with Client(doors.url) as client:
         assert client.map_version("room", info["version"]) == over_grpc
     assert over_http == info
+
+
+def test_a_map_tells_what_an_app_decides_by(
+    client: Client, name: str, pack: Pack, query: Query, built_maps: Path
+) -> None:
+    before = client.map("room")
+
+    def change(manifest: Any) -> None:
+        manifest["world"]["metric"] = False
+        manifest["parts"]["doubts"] = [
+            {"kind": "order", "message": f"doubt {i}", "photos": ["a.jpg"]} for i in range(40)
+        ]
+        others = [f"room-{i}@v1" for i in range(2, 42)]
+        manifest["method"]["settings"]["pieces"] = ["x" * 10_000, 7, None, "room-1", *others]
+        manifest["content_hash"] = content_hash(manifest)
+
+    client.upload_map(pack(name, change=change))
+    assert client.localize(query.image, "room", query.camera).pose.metric is True
+    client.use_version("room", name)
+    (told,) = client.maps()
+    answer = client.localize(query.image, "room", query.camera)
+    with pytest.warns(UserWarning, match="unknown length"):
+        session_from_map(np.eye(4), answer.pose, Axes.OPENGL)
+    client.use_version("room", before.version)
+    client.delete_version("room", name)
+
+    assert (before.metric, before.doubts, before.pieces) == (True, (), ())
+    assert (told.metric, answer.pose.metric) == (False, False)
+    assert [doubt.message for doubt in told.doubts] == [f"doubt {i}" for i in range(16)]
+    assert told.doubts[0].kind == "order"
+    assert told.pieces == tuple(f"room-{i}@v1" for i in range(2, 18))
+    opened = MapStore(built_maps).open("room")
+    test = opened.manifest.parts.own_test
+    assert (told.own_test.tested, told.own_test.wrong) == (test.tested, test.wrong)
+    assert {k: c.camera for k, c in told.cameras.items()} == dict(opened.cameras)
+    assert told.num_cameras == len(opened.cameras)
+
+
+def test_the_photos_of_a_map_and_their_cameras_come_in_pages(
+    client: Client, doors: Any, built_maps: Path
+) -> None:
+    opened = MapStore(built_maps).open("room")
+
+    page = client.images("room", 1, 2)
+
+    assert (page.first, page.total, page.map.id) == (1, len(opened.images), "room")
+    assert [each.name for each in page.images] == [each.name for each in opened.images[1:3]]
+    camera = page.images[0].camera
+    assert page.cameras[camera].camera == opened.cameras[camera]
+    over_http = doors.http.get("/maps/room/images?first=1&count=2").json()
+    assert page.model_dump(mode="json") == over_http
+    assert len(client.images("room").images) == len(opened.images)
+    assert client.images("room", 10_000).images == []
+
+
+@pytest.mark.parametrize(
+    ("asked", "code", "field"),
+    [
+        (("hall",), "map.unknown", "map"),
+        (("room@none",), "map.version", "map"),
+        (("../room",), "map.id", "map"),
+        (("room", -1), "request.invalid", "first"),
+        (("room", 2**32), "request.invalid", "first"),
+        (("room", 0, 0), "request.invalid", "count"),
+        (("room", 0, 10_001), "request.invalid", "count"),
+    ],
+)
+def test_photos_that_a_map_cannot_give_are_refused_by_name(
+    client: Client, asked: tuple[Any, ...], code: str, field: str
+) -> None:
+    with pytest.raises(VislocError) as caught:
+        client.images(*asked)
+    assert (caught.value.code, caught.value.field) == (code, field)
+
+
+@pytest.mark.parametrize(("field", "value"), [("count", 0), ("count", 10_001)])
+def test_a_page_of_photos_out_of_range_is_refused_over_grpc(
+    doors: Any, field: str, value: int
+) -> None:
+    with pytest.raises(grpc.RpcError) as caught:
+        doors.stub.GetImages(pb2.GetImagesRequest(map="room", **{field: value}))
+    assert caught.value.code() is grpc.StatusCode.INVALID_ARGUMENT
+    assert caught.value.details().startswith(f"{field}: the value is not valid (expected 1 to")
 
 
 def test_an_upload_answers_with_the_place_of_the_version(doors: Any, pack: Pack) -> None:

@@ -305,6 +305,12 @@ class Parts(Record):
     doubts: Annotated[tuple[Doubt, ...], Field(max_length=100)] = ()
 
 
+# In the settings of the largest of several maps of one build; there also if it is the only one.
+# Updates and merges drop it: nothing tells which versions of the pieces belong to what they make.
+PIECES = "pieces"
+_REF = re.compile(rf"{ID_PATTERN.pattern}@{ID_PATTERN.pattern}")
+
+
 class Manifest(Record):
     """``manifest.json``."""
 
@@ -341,6 +347,13 @@ class Manifest(Record):
             if not retrieval.weights.keys() <= known:
                 raise ValueError(f"weights of others than the map's {', '.join(sorted(known))}")
         return retrieval
+
+    @property
+    def pieces(self) -> list[str]:
+        """``id@version`` of the other pieces of the build that made this map, largest first."""
+        pieces = self.method.settings.get(PIECES)
+        refs = map(str, pieces) if isinstance(pieces, list) else ()
+        return [ref for ref in refs if _REF.fullmatch(ref)]
 
 
 class CameraRecord(Record):

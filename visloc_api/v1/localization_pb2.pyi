@@ -1135,10 +1135,13 @@ class PoseEstimate(_message.Message):
     PHOTO_COVARIANCE_FIELD_NUMBER: _builtins.int
     UNCERTAINTY_FIELD_NUMBER: _builtins.int
     PROBABILITY_FIELD_NUMBER: _builtins.int
+    METRIC_FIELD_NUMBER: _builtins.int
     uncertainty: _builtins.str
     """whole, or photo only: the map's own errors are not in covariance"""
     probability: _builtins.float
     """That the pose is right, 0 to 1; absent when it was not judged."""
+    metric: _builtins.bool
+    """Whether the unit of position and translation is the metre; false: its length is unknown."""
     @_builtins.property
     def cam_from_world(self) -> Global___Transform: ...
     @_builtins.property
@@ -1181,13 +1184,19 @@ class PoseEstimate(_message.Message):
         photo_covariance: _abc.Iterable[_builtins.float] | None = ...,
         uncertainty: _builtins.str = ...,
         probability: _builtins.float | None = ...,
+        metric: _builtins.bool | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_probability", b"_probability", "cam_from_world", b"cam_from_world", "probability", b"probability"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_metric", b"_metric", "_probability", b"_probability", "cam_from_world", b"cam_from_world", "metric", b"metric", "probability", b"probability"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_probability", b"_probability", "cam_from_world", b"cam_from_world", "covariance", b"covariance", "orientation", b"orientation", "orientation_std_deg", b"orientation_std_deg", "photo_covariance", b"photo_covariance", "position", b"position", "position_std", b"position_std", "probability", b"probability", "uncertainty", b"uncertainty"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_metric", b"_metric", "_probability", b"_probability", "cam_from_world", b"cam_from_world", "covariance", b"covariance", "metric", b"metric", "orientation", b"orientation", "orientation_std_deg", b"orientation_std_deg", "photo_covariance", b"photo_covariance", "position", b"position", "position_std", b"position_std", "probability", b"probability", "uncertainty", b"uncertainty"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__metric: _TypeAlias = _typing.Literal["metric"]  # noqa: Y015
+    _WhichOneofArgType__metric: _TypeAlias = _typing.Literal["_metric", b"_metric"]  # noqa: Y015
     _WhichOneofReturnType__probability: _TypeAlias = _typing.Literal["probability"]  # noqa: Y015
     _WhichOneofArgType__probability: _TypeAlias = _typing.Literal["_probability", b"_probability"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__metric) -> _WhichOneofReturnType__metric | None: ...
+    @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__probability) -> _WhichOneofReturnType__probability | None: ...
 
 Global___PoseEstimate: _TypeAlias = PoseEstimate  # noqa: Y015
@@ -1205,8 +1214,11 @@ class CoarsePose(_message.Message):
     POSITION_STD_FIELD_NUMBER: _builtins.int
     ORIENTATION_STD_DEG_FIELD_NUMBER: _builtins.int
     METHOD_FIELD_NUMBER: _builtins.int
+    METRIC_FIELD_NUMBER: _builtins.int
     method: _builtins.str
     """bdi, ewb or csi: how the photos' poses were put together"""
+    metric: _builtins.bool
+    """as in PoseEstimate"""
     @_builtins.property
     def cam_from_world(self) -> Global___Transform: ...
     @_builtins.property
@@ -1239,12 +1251,15 @@ class CoarsePose(_message.Message):
         position_std: _abc.Iterable[_builtins.float] | None = ...,
         orientation_std_deg: _abc.Iterable[_builtins.float] | None = ...,
         method: _builtins.str = ...,
+        metric: _builtins.bool | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["cam_from_world", b"cam_from_world"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_metric", b"_metric", "cam_from_world", b"cam_from_world", "metric", b"metric"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["cam_from_world", b"cam_from_world", "covariance", b"covariance", "method", b"method", "orientation", b"orientation", "orientation_std_deg", b"orientation_std_deg", "position", b"position", "position_std", b"position_std"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_metric", b"_metric", "cam_from_world", b"cam_from_world", "covariance", b"covariance", "method", b"method", "metric", b"metric", "orientation", b"orientation", "orientation_std_deg", b"orientation_std_deg", "position", b"position", "position_std", b"position_std"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    def WhichOneof(self, oneof_group: _Never) -> None: ...
+    _WhichOneofReturnType__metric: _TypeAlias = _typing.Literal["metric"]  # noqa: Y015
+    _WhichOneofArgType__metric: _TypeAlias = _typing.Literal["_metric", b"_metric"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__metric) -> _WhichOneofReturnType__metric | None: ...
 
 Global___CoarsePose: _TypeAlias = CoarsePose  # noqa: Y015
 
@@ -1806,10 +1821,13 @@ class RigPose(_message.Message):
     PHOTO_COVARIANCE_FIELD_NUMBER: _builtins.int
     UNCERTAINTY_FIELD_NUMBER: _builtins.int
     PROBABILITY_FIELD_NUMBER: _builtins.int
+    METRIC_FIELD_NUMBER: _builtins.int
     uncertainty: _builtins.str
     """as of PoseEstimate"""
     probability: _builtins.float
     """as of PoseEstimate; absent unless its own images measured it"""
+    metric: _builtins.bool
+    """as of PoseEstimate"""
     @_builtins.property
     def rig_from_world(self) -> Global___Transform: ...
     @_builtins.property
@@ -1844,13 +1862,19 @@ class RigPose(_message.Message):
         photo_covariance: _abc.Iterable[_builtins.float] | None = ...,
         uncertainty: _builtins.str = ...,
         probability: _builtins.float | None = ...,
+        metric: _builtins.bool | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_probability", b"_probability", "probability", b"probability", "rig_from_world", b"rig_from_world"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_metric", b"_metric", "_probability", b"_probability", "metric", b"metric", "probability", b"probability", "rig_from_world", b"rig_from_world"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_probability", b"_probability", "covariance", b"covariance", "orientation", b"orientation", "orientation_std_deg", b"orientation_std_deg", "photo_covariance", b"photo_covariance", "position", b"position", "position_std", b"position_std", "probability", b"probability", "rig_from_world", b"rig_from_world", "uncertainty", b"uncertainty"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_metric", b"_metric", "_probability", b"_probability", "covariance", b"covariance", "metric", b"metric", "orientation", b"orientation", "orientation_std_deg", b"orientation_std_deg", "photo_covariance", b"photo_covariance", "position", b"position", "position_std", b"position_std", "probability", b"probability", "rig_from_world", b"rig_from_world", "uncertainty", b"uncertainty"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__metric: _TypeAlias = _typing.Literal["metric"]  # noqa: Y015
+    _WhichOneofArgType__metric: _TypeAlias = _typing.Literal["_metric", b"_metric"]  # noqa: Y015
     _WhichOneofReturnType__probability: _TypeAlias = _typing.Literal["probability"]  # noqa: Y015
     _WhichOneofArgType__probability: _TypeAlias = _typing.Literal["_probability", b"_probability"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__metric) -> _WhichOneofReturnType__metric | None: ...
+    @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__probability) -> _WhichOneofReturnType__probability | None: ...
 
 Global___RigPose: _TypeAlias = RigPose  # noqa: Y015
@@ -2186,6 +2210,27 @@ class MapInfo(_message.Message):
         def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
         def WhichOneof(self, oneof_group: _Never) -> None: ...
 
+    @_typing.final
+    class CamerasEntry(_message.Message):
+        DESCRIPTOR: _descriptor.Descriptor
+
+        KEY_FIELD_NUMBER: _builtins.int
+        VALUE_FIELD_NUMBER: _builtins.int
+        key: _builtins.str
+        @_builtins.property
+        def value(self) -> Global___Camera: ...
+        def __init__(
+            self,
+            *,
+            key: _builtins.str = ...,
+            value: Global___Camera | None = ...,
+        ) -> None: ...
+        _HasFieldArgType: _TypeAlias = _typing.Literal["value", b"value"]  # noqa: Y015
+        def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+        _ClearFieldArgType: _TypeAlias = _typing.Literal["key", b"key", "value", b"value"]  # noqa: Y015
+        def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+        def WhichOneof(self, oneof_group: _Never) -> None: ...
+
     ID_FIELD_NUMBER: _builtins.int
     VERSION_FIELD_NUMBER: _builtins.int
     CREATED_FIELD_NUMBER: _builtins.int
@@ -2210,6 +2255,11 @@ class MapInfo(_message.Message):
     KIND_FIELD_NUMBER: _builtins.int
     NUM_TILES_FIELD_NUMBER: _builtins.int
     TILES_FIELD_NUMBER: _builtins.int
+    OWN_TEST_FIELD_NUMBER: _builtins.int
+    DOUBTS_FIELD_NUMBER: _builtins.int
+    PIECES_FIELD_NUMBER: _builtins.int
+    CAMERAS_FIELD_NUMBER: _builtins.int
+    NUM_CAMERAS_FIELD_NUMBER: _builtins.int
     id: _builtins.str
     version: _builtins.str
     created: _builtins.str
@@ -2233,6 +2283,8 @@ class MapInfo(_message.Message):
     """map, or set of maps"""
     num_tiles: _builtins.int
     """of a set"""
+    num_cameras: _builtins.int
+    """how many there are; 0 of a set"""
     @_builtins.property
     def global_features(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]: ...
     @_builtins.property
@@ -2261,6 +2313,22 @@ class MapInfo(_message.Message):
     def tiles(self) -> _containers.RepeatedCompositeFieldContainer[Global___Tile]:
         """of a set; ListMaps leaves them out"""
 
+    @_builtins.property
+    def own_test(self) -> Global___OwnTest:
+        """of a map that took one"""
+
+    @_builtins.property
+    def doubts(self) -> _containers.RepeatedCompositeFieldContainer[Global___Doubt]:
+        """at most 16"""
+
+    @_builtins.property
+    def pieces(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
+        """id@version of the other maps that the same build made, largest first; at most 16"""
+
+    @_builtins.property
+    def cameras(self) -> _containers.MessageMap[_builtins.str, Global___Camera]:
+        """by id; at most 16: GetImages has all"""
+
     def __init__(
         self,
         *,
@@ -2288,10 +2356,15 @@ class MapInfo(_message.Message):
         kind: _builtins.str = ...,
         num_tiles: _builtins.int | None = ...,
         tiles: _abc.Iterable[Global___Tile] | None = ...,
+        own_test: Global___OwnTest | None = ...,
+        doubts: _abc.Iterable[Global___Doubt] | None = ...,
+        pieces: _abc.Iterable[_builtins.str] | None = ...,
+        cameras: _abc.Mapping[_builtins.str, Global___Camera] | None = ...,
+        num_cameras: _builtins.int = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_anchor", b"_anchor", "_fusion", b"_fusion", "_method", b"_method", "_num_tiles", b"_num_tiles", "_observations", b"_observations", "_place", b"_place", "anchor", b"anchor", "extent", b"extent", "fusion", b"fusion", "method", b"method", "num_tiles", b"num_tiles", "observations", b"observations", "place", b"place"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_anchor", b"_anchor", "_fusion", b"_fusion", "_method", b"_method", "_num_tiles", b"_num_tiles", "_observations", b"_observations", "_own_test", b"_own_test", "_place", b"_place", "anchor", b"anchor", "extent", b"extent", "fusion", b"fusion", "method", b"method", "num_tiles", b"num_tiles", "observations", b"observations", "own_test", b"own_test", "place", b"place"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_anchor", b"_anchor", "_fusion", b"_fusion", "_method", b"_method", "_num_tiles", b"_num_tiles", "_observations", b"_observations", "_place", b"_place", "anchor", b"anchor", "content_hash", b"content_hash", "created", b"created", "current", b"current", "down", b"down", "extent", b"extent", "fusion", b"fusion", "fusion_weights", b"fusion_weights", "global_features", b"global_features", "id", b"id", "images", b"images", "kind", b"kind", "landmarks", b"landmarks", "local_features", b"local_features", "method", b"method", "metric", b"metric", "num_tiles", b"num_tiles", "observations", b"observations", "place", b"place", "rigs", b"rigs", "size_bytes", b"size_bytes", "tiles", b"tiles", "version", b"version", "versions", b"versions"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_anchor", b"_anchor", "_fusion", b"_fusion", "_method", b"_method", "_num_tiles", b"_num_tiles", "_observations", b"_observations", "_own_test", b"_own_test", "_place", b"_place", "anchor", b"anchor", "cameras", b"cameras", "content_hash", b"content_hash", "created", b"created", "current", b"current", "doubts", b"doubts", "down", b"down", "extent", b"extent", "fusion", b"fusion", "fusion_weights", b"fusion_weights", "global_features", b"global_features", "id", b"id", "images", b"images", "kind", b"kind", "landmarks", b"landmarks", "local_features", b"local_features", "method", b"method", "metric", b"metric", "num_cameras", b"num_cameras", "num_tiles", b"num_tiles", "observations", b"observations", "own_test", b"own_test", "pieces", b"pieces", "place", b"place", "rigs", b"rigs", "size_bytes", b"size_bytes", "tiles", b"tiles", "version", b"version", "versions", b"versions"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__anchor: _TypeAlias = _typing.Literal["anchor"]  # noqa: Y015
     _WhichOneofArgType__anchor: _TypeAlias = _typing.Literal["_anchor", b"_anchor"]  # noqa: Y015
@@ -2303,6 +2376,8 @@ class MapInfo(_message.Message):
     _WhichOneofArgType__num_tiles: _TypeAlias = _typing.Literal["_num_tiles", b"_num_tiles"]  # noqa: Y015
     _WhichOneofReturnType__observations: _TypeAlias = _typing.Literal["observations"]  # noqa: Y015
     _WhichOneofArgType__observations: _TypeAlias = _typing.Literal["_observations", b"_observations"]  # noqa: Y015
+    _WhichOneofReturnType__own_test: _TypeAlias = _typing.Literal["own_test"]  # noqa: Y015
+    _WhichOneofArgType__own_test: _TypeAlias = _typing.Literal["_own_test", b"_own_test"]  # noqa: Y015
     _WhichOneofReturnType__place: _TypeAlias = _typing.Literal["place"]  # noqa: Y015
     _WhichOneofArgType__place: _TypeAlias = _typing.Literal["_place", b"_place"]  # noqa: Y015
     @_typing.overload
@@ -2316,9 +2391,198 @@ class MapInfo(_message.Message):
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__observations) -> _WhichOneofReturnType__observations | None: ...
     @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__own_test) -> _WhichOneofReturnType__own_test | None: ...
+    @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__place) -> _WhichOneofReturnType__place | None: ...
 
 Global___MapInfo: _TypeAlias = MapInfo  # noqa: Y015
+
+@_typing.final
+class OwnTest(_message.Message):
+    """The test that a map took when it was made: its own photos, each in the map without itself."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    TESTED_FIELD_NUMBER: _builtins.int
+    LOCALIZED_FIELD_NUMBER: _builtins.int
+    WRONG_FIELD_NUMBER: _builtins.int
+    tested: _builtins.int
+    """photos that were tried"""
+    localized: _builtins.int
+    """of these, those that got a pose"""
+    wrong: _builtins.int
+    """of these, those at another place than the photo"""
+    def __init__(
+        self,
+        *,
+        tested: _builtins.int = ...,
+        localized: _builtins.int = ...,
+        wrong: _builtins.int = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["localized", b"localized", "tested", b"tested", "wrong", b"wrong"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___OwnTest: _TypeAlias = OwnTest  # noqa: Y015
+
+@_typing.final
+class Doubt(_message.Message):
+    """What speaks against a map."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    KIND_FIELD_NUMBER: _builtins.int
+    MESSAGE_FIELD_NUMBER: _builtins.int
+    kind: _builtins.str
+    """a word, such as own_test, left_out or scale"""
+    message: _builtins.str
+    """for a person"""
+    def __init__(
+        self,
+        *,
+        kind: _builtins.str = ...,
+        message: _builtins.str = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["kind", b"kind", "message", b"message"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Doubt: _TypeAlias = Doubt  # noqa: Y015
+
+@_typing.final
+class GetImagesRequest(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    MAP_FIELD_NUMBER: _builtins.int
+    FIRST_FIELD_NUMBER: _builtins.int
+    COUNT_FIELD_NUMBER: _builtins.int
+    map: _builtins.str
+    """id, or id@version"""
+    first: _builtins.int
+    """place in the map's order to begin at; 0 when left out"""
+    count: _builtins.int
+    """1 to 10 000; 1000 when left out"""
+    def __init__(
+        self,
+        *,
+        map: _builtins.str = ...,
+        first: _builtins.int | None = ...,
+        count: _builtins.int | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_count", b"_count", "_first", b"_first", "count", b"count", "first", b"first"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_count", b"_count", "_first", b"_first", "count", b"count", "first", b"first", "map", b"map"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__count: _TypeAlias = _typing.Literal["count"]  # noqa: Y015
+    _WhichOneofArgType__count: _TypeAlias = _typing.Literal["_count", b"_count"]  # noqa: Y015
+    _WhichOneofReturnType__first: _TypeAlias = _typing.Literal["first"]  # noqa: Y015
+    _WhichOneofArgType__first: _TypeAlias = _typing.Literal["_first", b"_first"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__count) -> _WhichOneofReturnType__count | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__first) -> _WhichOneofReturnType__first | None: ...
+
+Global___GetImagesRequest: _TypeAlias = GetImagesRequest  # noqa: Y015
+
+@_typing.final
+class MapImages(_message.Message):
+    """Mapping photos of one version of a map, in the map's order."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    @_typing.final
+    class CamerasEntry(_message.Message):
+        DESCRIPTOR: _descriptor.Descriptor
+
+        KEY_FIELD_NUMBER: _builtins.int
+        VALUE_FIELD_NUMBER: _builtins.int
+        key: _builtins.str
+        @_builtins.property
+        def value(self) -> Global___Camera: ...
+        def __init__(
+            self,
+            *,
+            key: _builtins.str = ...,
+            value: Global___Camera | None = ...,
+        ) -> None: ...
+        _HasFieldArgType: _TypeAlias = _typing.Literal["value", b"value"]  # noqa: Y015
+        def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+        _ClearFieldArgType: _TypeAlias = _typing.Literal["key", b"key", "value", b"value"]  # noqa: Y015
+        def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+        def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+    MAP_FIELD_NUMBER: _builtins.int
+    TOTAL_FIELD_NUMBER: _builtins.int
+    FIRST_FIELD_NUMBER: _builtins.int
+    CAMERAS_FIELD_NUMBER: _builtins.int
+    IMAGES_FIELD_NUMBER: _builtins.int
+    total: _builtins.int
+    """photos that the map has"""
+    first: _builtins.int
+    """as asked for"""
+    @_builtins.property
+    def map(self) -> Global___MapRef: ...
+    @_builtins.property
+    def cameras(self) -> _containers.MessageMap[_builtins.str, Global___Camera]:
+        """of these photos, by id"""
+
+    @_builtins.property
+    def images(self) -> _containers.RepeatedCompositeFieldContainer[Global___MapImage]: ...
+    def __init__(
+        self,
+        *,
+        map: Global___MapRef | None = ...,
+        total: _builtins.int = ...,
+        first: _builtins.int = ...,
+        cameras: _abc.Mapping[_builtins.str, Global___Camera] | None = ...,
+        images: _abc.Iterable[Global___MapImage] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["map", b"map"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["cameras", b"cameras", "first", b"first", "images", b"images", "map", b"map", "total", b"total"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___MapImages: _TypeAlias = MapImages  # noqa: Y015
+
+@_typing.final
+class MapImage(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    NAME_FIELD_NUMBER: _builtins.int
+    CAMERA_FIELD_NUMBER: _builtins.int
+    POSITION_FIELD_NUMBER: _builtins.int
+    ORIENTATION_FIELD_NUMBER: _builtins.int
+    name: _builtins.str
+    camera: _builtins.str
+    """key of MapImages.cameras"""
+    @_builtins.property
+    def position(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """camera centre in the world"""
+
+    @_builtins.property
+    def orientation(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """rotation of world_from_cam as w, x, y, z"""
+
+    def __init__(
+        self,
+        *,
+        name: _builtins.str = ...,
+        camera: _builtins.str = ...,
+        position: _abc.Iterable[_builtins.float] | None = ...,
+        orientation: _abc.Iterable[_builtins.float] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["camera", b"camera", "name", b"name", "orientation", b"orientation", "position", b"position"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___MapImage: _TypeAlias = MapImage  # noqa: Y015
 
 @_typing.final
 class Tile(_message.Message):

@@ -12,8 +12,11 @@ from pydantic import BeforeValidator, Field, PlainSerializer, model_validator
 import visloc.geometry
 from visloc_api.words.base import Answer, OneOf, SentAs
 from visloc_api.words.message import IncomingMessage
+from visloc_api.words.scenes import MapCamera
 
 Numbers = tuple[float, ...]
+# Of each list that a listing of thousands of maps repeats.
+MAX_LISTED = 16
 # Least and greatest x, y, z.
 Box = tuple[Numbers, Numbers]
 
@@ -162,6 +165,21 @@ class Tile(Answer):
         return f"{self.map}@{self.version}"
 
 
+class OwnTest(Answer):
+    """The test that a map took when it was made: own photos, each in the map without itself."""
+
+    tested: Annotated[int, Field(description="photos that were tried")]
+    localized: Annotated[int, Field(description="of these, those that got a pose")]
+    wrong: Annotated[int, Field(description="of these, those at another place than the photo")]
+
+
+class Doubt(Answer):
+    """What speaks against a map."""
+
+    kind: Annotated[str, Field(description="a word, such as own_test, left_out or scale")]
+    message: Annotated[str, Field(description="for a person")]
+
+
 class VersionInfo(Answer):
     """A published version of a map."""
 
@@ -238,6 +256,28 @@ class MapInfo(Answer):
     tiles: Annotated[
         tuple[Tile, ...], Field(description="the maps of a set; left empty in lists of maps")
     ] = ()
+    own_test: Annotated[
+        OwnTest | None, Field(description="null for a set, and for a map that took none")
+    ] = None
+    doubts: Annotated[
+        tuple[Doubt, ...],
+        Field(description=f"why somebody should look at the map first; at most {MAX_LISTED}"),
+    ] = ()
+    pieces: Annotated[
+        tuple[str, ...],
+        Field(
+            description="id@version of the other maps that the same build made of photos which "
+            f"nothing links to these, largest first; at most {MAX_LISTED}"
+        ),
+    ] = ()
+    cameras: Annotated[
+        dict[str, MapCamera],
+        Field(
+            description="by id; for a photo that one of them took, send it as the camera. At most "
+            f"{MAX_LISTED}: GET /maps/{{ref}}/images has all"
+        ),
+    ] = {}  # noqa: RUF012  pydantic copies it
+    num_cameras: Annotated[int, Field(description="how many there are; 0 for a set")] = 0
 
     @property
     def ref(self) -> str:

@@ -67,6 +67,13 @@ _Uncertainty = Annotated[
     Field(description=_UNCERTAINTY),
 ]
 _PhotoCovariance = Annotated[OptionalCovariance, Field(description=_PHOTO_PART)]
+_Metric = Annotated[
+    bool | None,
+    Field(
+        description="whether the unit of position and translation is the metre; false: its length "
+        "is unknown; null: an older service, which does not say"
+    ),
+]
 
 
 class _ReceivedPose(Pose):
@@ -139,6 +146,7 @@ class PoseEstimate(_PoseWithDigits):
     probability: Annotated[
         float | None, Field(ge=0, le=1, description=f"{_PROBABILITY}null when it was not judged")
     ] = None
+    metric: _Metric = None
 
 
 class CoarsePose(_PoseWithDigits):
@@ -171,6 +179,7 @@ class CoarsePose(_PoseWithDigits):
             "ewb: their mean; csi: their mean weighted by similarity"
         ),
     ]
+    metric: _Metric = None
 
 
 class RigPose(_PoseWithDigits):
@@ -198,3 +207,4 @@ class RigPose(_PoseWithDigits):
             "only with the help of other instants",
         ),
     ] = None
+    metric: _Metric = None

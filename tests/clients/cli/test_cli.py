@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from clients.cli.main import main
+from tests.clients.conftest import POSE
 
 
 def localize(*arguments: object) -> int:
@@ -82,19 +83,20 @@ def test_a_photo_that_is_not_localized_has_its_own_exit_code_and_says_why(
     assert "position" not in out
 
 
-def test_a_pose_is_printed_even_when_the_unit_cannot_be_asked_for(
+@pytest.mark.parametrize(
+    ("metric", "unit"), [(True, "m"), (False, "units of the map"), (None, "units of the map")]
+)
+def test_a_pose_is_printed_in_the_unit_that_its_answer_tells(
+    metric: bool | None,
+    unit: str,
     url: str,
     photo: Path,
     capsys: pytest.CaptureFixture[str],
-    service: Any,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    map_info = service.map_info
-    monkeypatch.setattr(service, "map_info", lambda ref: map_info("hall" if "@" in ref else ref))
+    monkeypatch.setitem(POSE, "metric", metric)
     assert localize("image", photo, "--map", "room", "--server", url) == 0
-    captured = capsys.readouterr()
-    assert "1 0.3 -3.5 units of the map" in captured.out
-    assert "map.unknown" in captured.err
+    assert f"1 0.3 -3.5 {unit}, std" in capsys.readouterr().out
 
 
 def test_json_is_the_answer_as_received(

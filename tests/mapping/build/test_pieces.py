@@ -13,11 +13,9 @@ import pytest
 
 from mapping.build.build import build_map
 from mapping.build.pieces import (
-    PIECES,
     WrittenMap,
     ids_of_pieces,
     note_of_piece,
-    pieces_of,
     publish_pieces,
     refuse_long_id,
     use_version,
@@ -30,7 +28,7 @@ from mapping.methods.sfm_settings import SfmSettings
 from mapping.own_test.publishing import write_content
 from mapping.sample import write_sample
 from visloc.archive import Map, MapStore, open_map
-from visloc.archive.schema import Doubt
+from visloc.archive.schema import PIECES, Doubt
 from visloc.errors import Conflict, InvalidInput, NotFound
 from visloc.features import make_local_features
 from visloc.geometry import Pose
@@ -120,8 +118,8 @@ def test_each_room_is_a_map_of_its_own(built: Path) -> None:
 def test_the_largest_names_the_other(built: Path) -> None:
     store = MapStore(built)
     largest, other = store.open("home"), store.open("home-2")
-    assert pieces_of(largest.manifest) == [other.ref]
-    assert pieces_of(other.manifest) == []
+    assert largest.manifest.pieces == [other.ref]
+    assert other.manifest.pieces == []
     assert any(f"{other.ref} of {IN_ROOM[1]} photos" in n for n in largest.manifest.notes)
     assert note_of_piece("home-2", "home") in other.manifest.notes
 
