@@ -114,7 +114,8 @@ def verdict(trials: Trials, captured: Captured, opened: Map) -> str:
     size = (
         "Its unit is a metre."
         if opened.manifest.world.metric
-        else "Its size is not known: give --scale or --marker-size, or photos with GPS."
+        else "Its size is not known: give it with mapping edit --scale, or capture again with "
+        "--marker-size or photos with GPS."
     )
     lines = [
         f"The map is {grade}: {len(opened.images)} of {len(captured.photos)} photos are in it.",

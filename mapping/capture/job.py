@@ -17,7 +17,7 @@ from mapping.build.settings import BuildSettings
 from mapping.capture.frames import FilmedVideo, photo_name
 from mapping.capture.markers import find_markers, grey_photos
 from mapping.capture.placing import Yardstick, place
-from mapping.capture.settings import CaptureSettings, KnownLength
+from mapping.capture.settings import CaptureSettings, KnownLength, photo_named
 from mapping.capture.sources import Sources, find_sources, read_capture, study_videos
 from mapping.capture.trying import doubts_of_capture, lost_size
 from mapping.cluster.stage_timings import Costs
@@ -324,10 +324,7 @@ def _resolved(
             times = motion.seconds[videos[name].chosen.rows]
             found.append(f"{name}/{photo_name(float(times[abs(times - second).argmin()]))}")
             continue
-        ends = [one for one in names if one == text or one.endswith(f"/{text}")]
-        if len(ends) != 1:
-            raise refuse("capture.photo", field="--scale", got=f"{text}: {len(ends)} photos")
-        found.append(ends[0])
+        found.append(photo_named(text, names))
     if found[0] == found[1]:
         raise refuse("capture.photo", field="--scale", got=f"{found[0]} for both")
     return found[0], found[1], length.metres

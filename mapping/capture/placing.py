@@ -104,20 +104,22 @@ def _moved(made: MadeLandmarks, similarity: Similarity) -> MadeLandmarks:
 
 def _scale(yardstick: Yardstick, views: Mapping[str, View]) -> Scale | None:
     if yardstick.length is not None:
-        return _scale_of_length(*yardstick.length, views)
+        centers = {name: view.cam_from_world.center for name, view in views.items()}
+        return scale_of_length(*yardstick.length, centers)
     if yardstick.marker_m is not None:
         return _scale_of_markers(yardstick.sightings, yardstick.marker_m, views)
     return None
 
 
-def _scale_of_length(first: str, second: str, metres: float, views: Mapping[str, View]) -> Scale:
-    absent = [name for name in (first, second) if name not in views]
+def scale_of_length(
+    first: str, second: str, metres: float, centers: Mapping[str, NDArray[np.float64]]
+) -> Scale:
+    """Return the scale that the distance between two photos tells, of their centres by name."""
+    absent = [name for name in (first, second) if name not in centers]
     if absent:
         return Scale(None, f"no scale: {absent[0]} of --scale found no place in the map", {})
-    a, b = (views[name].cam_from_world.center for name in (first, second))
-    centers = np.array([view.cam_from_world.center for view in views.values()])
-    units = float(np.linalg.norm(a - b))
-    if units <= _LEAST_SHARE * float(np.ptp(centers, axis=0).max()):
+    units = float(np.linalg.norm(centers[first] - centers[second]))
+    if units <= _LEAST_SHARE * float(np.ptp(np.array([*centers.values()]), axis=0).max()):
         return Scale(None, "no scale: the photos of --scale were taken at one place", {})
     record: dict[str, JsonValue] = {"by": "length", "photos": [first, second], "metres": metres}
     return Scale(metres / units, f"scale: {first} and {second} are {metres:g} m apart", record)

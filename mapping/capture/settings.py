@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -53,9 +54,24 @@ def metres_in(text: str, field: str) -> float:
     return metres
 
 
-def _known_length(given: tuple[str, str, str]) -> KnownLength:
+def known_length(given: tuple[str, str, str]) -> KnownLength:
+    """Read ``--scale``; raises ``capture.length``."""
     first, second, length = given
     return KnownLength((first, second), metres_in(length, "--scale"))
+
+
+def photo_named(text: str, names: Collection[str]) -> str:
+    """Return the photo of this name, or the only one whose name ends so.
+
+    Raises:
+        InvalidInput: ``capture.photo``.
+    """
+    if text in names:
+        return text
+    ends = [one for one in names if one.endswith(f"/{text}")]
+    if len(ends) != 1:
+        raise refuse("capture.photo", field="--scale", got=f"{text}: {len(ends)} photos")
+    return ends[0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +121,7 @@ class CaptureSettings:
         Raises:
             InvalidInput: ``capture.length``.
         """
-        return None if self.scale is None else _known_length(self.scale)
+        return None if self.scale is None else known_length(self.scale)
 
     @property
     def marker_m(self) -> float | None:

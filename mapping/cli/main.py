@@ -22,7 +22,7 @@ from mapping.cli.datasets import (
 )
 from mapping.cli.display import ERR
 from mapping.cli.from_settings import from_settings
-from mapping.cli.maps import anchor, export, inspect, pack, upgrade, verify
+from mapping.cli.maps import anchor, edit, export, inspect, pack, upgrade, verify
 from mapping.cli.merge import merge
 from mapping.cli.prune import prune
 from mapping.cli.report import report
@@ -37,6 +37,7 @@ COMMANDS: Mapping[str, Callable[..., None]] = {
     "calibrate-rig": calibrate_rig_command,
     "import": import_,
     "anchor": anchor,
+    "edit": edit,
     "upgrade": upgrade,
     "export": export,
     "pack": pack,

@@ -13,6 +13,8 @@ from typing import Annotated
 
 import typer
 
+from mapping.capture.settings import known_length
+from mapping.cli.acceptance import require_acceptance
 from mapping.cli.display import ERR, print_georeference, print_map, say, say_notes, summary_of
 from mapping.cli.progress import StageProgress
 from mapping.cli.sets import print_set, set_summary, verify_tiles
@@ -28,11 +30,21 @@ from mapping.frames.georeference import (
 from mapping.frames.kept_fixes import contradiction_of_fixes
 from mapping.maps.export import EXPORTERS, Queries, export_map
 from mapping.maps.packing import write_packed
+from mapping.maps.sizing import publish_sized
 from mapping.maps.upgrading import lacking, upgrade_map
-from mapping.options import Gravity, MapArgument, MapsDirOption, WeightsDirOption
+from mapping.options import AcceptOption, Gravity, MapArgument, MapsDirOption, WeightsDirOption
 from mapping.progress import one_step
 from mapping.stages.imported_points import read_imported_points
-from visloc.archive import Anchor, Map, SetManifest, open_map, open_set, verify_map, verify_set
+from visloc.archive import (
+    Anchor,
+    Map,
+    MapStore,
+    SetManifest,
+    open_map,
+    open_set,
+    verify_map,
+    verify_set,
+)
 from visloc.archive.checks import read_any_manifest
 from visloc.errors import refuse
 from visloc.features import make_global_descriptor, make_local_features
@@ -149,6 +161,38 @@ def anchor(
     _say_contradiction(opened, found.anchor)
     folder = publish_anchored(opened, found, maps_dir, force=force)
     say(f"map {open_map(folder).ref}")
+
+
+def edit(
+    map_ref: MapArgument,
+    scale: Annotated[
+        tuple[str, str, str],
+        typer.Option(
+            metavar="PHOTO PHOTO LENGTH",
+            help="Distance between where two photos of the map were taken, such as a.jpg b.jpg "
+            "3.2m. GET /maps/MAP/images, and mapping export, name its photos.",
+        ),
+    ],
+    maps_dir: MapsDirOption = Path("maps"),
+    force: Annotated[
+        bool, typer.Option("--force", help="Measure a map anew that is in metres already.")
+    ] = False,
+    accept: AcceptOption = False,
+) -> None:
+    """Give a map its size by a known length; publish it in metres, as a new version.
+
+    Poses and landmarks are scaled about the world's (0, 0, 0); directions stay.
+    """
+    store = MapStore(maps_dir)
+    opened, length = open_map(map_folder(map_ref, maps_dir)), known_length(scale)
+    with StageProgress(ERR, if_stopped="nothing was published") as progress:
+        folder = publish_sized(store, opened, length, force=force, accept=accept, progress=progress)
+    sized = open_map(folder)
+    print_map(sized)
+    if opened.manifest.pieces:
+        pieces = ", ".join(opened.manifest.pieces)
+        say_notes([f"other pieces of the same build keep units of their own: {pieces}"])
+    require_acceptance(sized, accept=accept, pictures=maps_dir / ".work" / ".doubts")
 
 
 def upgrade(map_ref: MapArgument, maps_dir: MapsDirOption = Path("maps")) -> None:

@@ -69,7 +69,7 @@ def _not_back(opened: Map, run: OwnTestRun) -> Doubt | None:
         return None
     right = test.localized - test.wrong
     # Where poses were given, photos that find no place tell that the map is sparse, not wrong.
-    is_broken = _has_estimated_poses(opened) and right < LEAST_BACK * test.tested
+    is_broken = has_estimated_poses(opened) and right < LEAST_BACK * test.tested
     if test.wrong <= MOST_WRONG * test.tested and not is_broken:
         return None
     names = [opened.images[row].name for row in (*run.wrong, *run.refused)]
@@ -91,7 +91,7 @@ def _without_place(opened: Map, left_out: Sequence[str]) -> Doubt | None:
 
 def _apart(opened: Map) -> Doubt | None:
     """Doubt a map whose photos, placed by its landmarks alone, hang together by too few of them."""
-    if not _has_estimated_poses(opened):
+    if not has_estimated_poses(opened):
         return None  # pieces that do not see each other may have known poses
     pieces = _pieces(opened)
     sizes = np.bincount(pieces)
@@ -109,7 +109,7 @@ def _apart(opened: Map) -> Doubt | None:
 
 def _two_places(opened: Map) -> Doubt | None:
     """Doubt a map in which photos of two places seem to have been taken beside each other."""
-    if not _has_estimated_poses(opened):
+    if not has_estimated_poses(opened):
         # A map keeps only keypoints that were matched: where few pairs were, others seem missing.
         return None
     rows = find_places(_model_photos(opened), opened.landmarks.astype(np.float64)).doubted()
@@ -141,7 +141,8 @@ def _model_photos(opened: Map) -> list[ModelPhoto]:
     return photos
 
 
-def _has_estimated_poses(opened: Map) -> bool:
+def has_estimated_poses(opened: Map) -> bool:
+    """Tell whether the photos placed each other, so that a pose may be wrong with its landmarks."""
     return opened.manifest.method.settings.get("poses") == "estimate"
 
 

@@ -1,0 +1,103 @@
+"""``mapping edit``: a known length gives a finished map its size."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from mapping.capture.placing import scale_of_length
+from mapping.capture.settings import KnownLength, photo_named
+from mapping.capture.trying import doubts_of_capture
+from mapping.frames.anchor import MAX_SCALE_ERROR
+from mapping.maps.editing import content_of, moved
+from mapping.methods.retrieval_only import refuse_without_landmarks
+from mapping.methods.sfm import UNPLACED
+from mapping.own_test.publishing import publish_tested, write_content
+from mapping.own_test.verdict import has_estimated_poses
+from mapping.progress import Progress
+from mapping.stages.imported_points import read_imported_points
+from mapping.stages.publishing import PAIRS, link_photos, photo_files, successor_of
+from visloc.archive import Map, MapStore
+from visloc.archive.anchoring import link_or_copy
+from visloc.errors import refuse
+from visloc.geometry import Pose, Similarity
+
+
+def publish_sized(
+    store: MapStore,
+    opened: Map,
+    length: KnownLength,
+    *,
+    force: bool,
+    accept: bool,
+    progress: Progress,
+) -> Path:
+    """Publish a map in metres, as the distance of two of its photos tells them, as a new version.
+
+    Directions and the place of the origin stay. The version takes its own test anew. Where photos
+    placed each other, there is a doubt if the two do not come back where they are.
+
+    Args:
+        force: measure a map anew that is in metres already.
+        accept: put it into use whatever speaks against it.
+
+    Raises:
+        InvalidInput: ``capture.photo``; ``edit.scale`` when the length tells no scale, or not the
+            one that the map's place on Earth tells.
+        Conflict: ``edit.metric`` without ``force``; ``map.no_landmarks``; ``map.outdated``;
+            ``build.running``.
+    """
+    refuse_without_landmarks(opened)
+    manifest = opened.manifest
+    if manifest.world.metric and not force:
+        raise refuse("edit.metric", field="--force", ref=opened.ref)
+    names = [image.name for image in opened.images]
+    first, second = (photo_named(text, names) for text in length.photos)
+    if first == second:
+        raise refuse("capture.photo", field="--scale", got=f"{first} for both")
+    poses = (Pose.from_quaternion(row[:4], row[4:]) for row in opened.image_poses)
+    centers = {name: pose.center for name, pose in zip(names, poses, strict=True)}
+    scale = scale_of_length(first, second, length.metres, centers)
+    if scale.metres is None:
+        raise refuse("edit.scale", field="--scale", got=scale.note)
+    geodetic = opened.geodetic
+    if geodetic and abs(math.log(geodetic.scale / scale.metres)) > 2 * MAX_SCALE_ERROR:
+        raise refuse(
+            "edit.scale",
+            "the length contradicts the map's place on Earth",
+            field="--scale",
+            expected=f"a unit of {geodetic.scale:.4g} m to within {2 * MAX_SCALE_ERROR:.0%}",
+            got=f"a unit of {scale.metres:.4g} m",
+        )
+    units = Similarity(scale.metres, np.eye(3), np.zeros(3))
+    content = moved(content_of(opened), units, metric=True)
+    content = replace(
+        content,
+        settings={**content.settings, "scale": dict(scale.record)},
+        notes=(*(note for note in content.notes if note != UNPLACED), scale.note),
+    )
+    # A doubt about the length that told the size before is settled.
+    known = tuple(doubt for doubt in manifest.parts.doubts if doubt.kind != "scale")
+    with successor_of(opened, store), store.incoming() as incoming:
+        link_photos(incoming, photo_files(opened))
+        if PAIRS in manifest.files:
+            link_or_copy(opened.path / PAIRS, incoming / PAIRS)
+        if (imported := read_imported_points(opened)) is not None:
+            replace(imported, points=units.apply(imported.points)).write(incoming)
+        version = write_content(
+            incoming,
+            content,
+            manifest.id,
+            examine=partial(doubts_of_capture, films={}, measured=(first, second))
+            if has_estimated_poses(opened)
+            else None,
+            carried=known,
+            progress=progress,
+        )
+        return publish_tested(
+            store, incoming, manifest.id, version, based_on=manifest.version, accept=accept
+        )
