@@ -335,6 +335,29 @@ describe("errors", () => {
     });
   });
 
+  test.each([
+    ["not there", "https://app.example.org", false, "server.unreachable"],
+    ["there, and does not allow the page", "https://app.example.org", true, "access.origin"],
+    ["there, and does not allow an app", "capacitor://localhost", true, "access.origin"],
+    ["not there, for its own page", BASE.origin, false, "server.unreachable"],
+    ["in trouble, for its own page", BASE.origin, true, "server.unreachable"],
+  ])("of a service that is %s, a page of %s is told", async (_, origin, isThere, code) => {
+    vi.stubGlobal("location", { origin });
+    const probes: string[] = [];
+    vi.stubGlobal("fetch", async (url: URL, init: RequestInit) => {
+      if (init.mode === "no-cors") probes.push(url.href);
+      if (init.mode === "no-cors" && isThere) return new Response();
+      throw new TypeError("Failed to fetch");
+    });
+    const { problem } = await failure(connect(BASE).maps());
+    expect([problem.code, problem.status]).toEqual([code, 0]);
+    if (code === "access.origin") expect(problem.got).toBe(origin);
+    // Nothing is asked twice of a page's own service.
+    expect(probes).toEqual(
+      origin === BASE.origin ? [] : ["https://maps.example.org/visloc/healthz"],
+    );
+  });
+
   test("a service that is not there is unreachable", async () => {
     answering(() => Promise.reject(new TypeError("Failed to fetch")));
     const { problem } = await failure(connect(BASE).maps());

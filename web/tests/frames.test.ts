@@ -1,4 +1,4 @@
-import { describe, expect, test } from "vitest";
+import { describe, expect, test, vi } from "vitest";
 import {
   blended,
   cameraMatrix,
@@ -46,6 +46,21 @@ describe.each(AXES)("in the axes of %s", (axes) => {
       expect(value).toBeCloseTo(seen[i]!, 12),
     );
   });
+});
+
+test("a pose whose unit has an unknown length is warned of once", async () => {
+  const warn = vi.spyOn(console, "warn").mockImplementation(() => undefined);
+  const identity = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
+  const pose = posed([1, 0, 0, 0], [0, 0, 0]);
+  for (const known of [{ metric: true }, { metric: null }, {}]) {
+    sessionFromMap(identity, { ...pose, ...known }, "opengl");
+  }
+  expect(warn).not.toHaveBeenCalled();
+  sessionFromMap(identity, { ...pose, metric: false }, "opengl");
+  sessionFromMap(identity, { ...pose, metric: false }, "opengl");
+  expect(warn).toHaveBeenCalledOnce();
+  expect(String(warn.mock.calls[0]![0])).toContain("unknown length");
+  warn.mockRestore();
 });
 
 test.each(truths)("what lies between is as in Python: $translation", (truth) => {

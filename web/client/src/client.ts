@@ -18,6 +18,7 @@ import type { LocalizeResponse, MapImages, MapInfo, OptionSchema, RigResponse } 
 /** Before a request is sent a second time, to another server behind the same address. */
 const RESEND_PAUSE_MS = 100;
 const DEFAULT_TIMEOUT_S = 60;
+const PROBE_MS = 3000;
 const NDJSON = "application/x-ndjson";
 const RIG_MEMBERS = ["status", "images", "map", "seconds"] as const;
 
@@ -66,9 +67,32 @@ export function connect(server: string | URL, settings: Settings = {}): Client {
     await new Promise((resolve) => setTimeout(resolve, RESEND_PAUSE_MS));
     request.signal?.throwIfAborted();
     const second = await once(path, request);
-    if (!(second instanceof Response)) throw second;
+    if (!(second instanceof Response)) throw (await keptFrom(second, request)) ?? second;
     if (!second.ok) throw await serviceError(second);
     return second;
+  }
+
+  /**
+   * A browser says the same of a service that is not there and of one that does not allow the page.
+   * What it may not read it can still ask for: an answer tells that somebody is there.
+   */
+  async function keptFrom({ code }: ServiceError, request: Asking): Promise<ServiceError | null> {
+    const page = (globalThis as { location?: Location }).location?.origin ?? base.origin;
+    if (code !== "server.unreachable" || page === base.origin) return null;
+    const limits = [AbortSignal.timeout(PROBE_MS), ...(request.limit ? [request.limit] : [])];
+    const signal = AbortSignal.any(limits);
+    try {
+      await fetch(new URL("healthz", base), { mode: "no-cors", credentials: "omit", signal });
+    } catch {
+      request.signal?.throwIfAborted();
+      return null;
+    }
+    const detail =
+      "the service is there, but it does not allow pages of this origin to read its answers";
+    return ownError("access.origin", "Not allowed", detail, {
+      expected: "an origin that the service's operator allows (--cors-origins)",
+      got: page,
+    });
   }
 
   async function once(path: string, request: Asking): Promise<Response | ServiceError> {

@@ -20,7 +20,11 @@ export type Matrix4 = number[];
 /** The pose of an answer, or of a photo of a rig's answer. */
 export interface Posed {
   cam_from_world: Transform;
+  metric?: boolean | null;
 }
+
+/** One warning is enough: a session asks several times a second. */
+let warned = false;
 
 /** How much a matrix may differ from a rigid one: what float32 leaves of it. */
 const TOLERANCE = 1e-4;
@@ -40,7 +44,8 @@ export function cameraMatrix(pose: Posed, axes: Axes = "opencv"): Matrix4 {
  * Where the map lies in the session: what moves content of the map to its place.
  *
  * `sessionFromCamera` is the device's own pose when the photo was taken. Keep it with the photo: the
- * answer comes later, and the device has moved on. The map must be metric. Throws ServiceError
+ * answer comes later, and the device has moved on. Of a pose whose unit has an unknown length, the
+ * console is warned once: content gets the wrong size and distance. Throws ServiceError
  * `frames.not_rigid`.
  */
 export function sessionFromMap(
@@ -48,6 +53,13 @@ export function sessionFromMap(
   pose: Posed,
   axes: Axes,
 ): Matrix4 {
+  if (pose.metric === false && !warned) {
+    warned = true;
+    console.warn(
+      "visloc: the unit of this map has an unknown length, and that of the session is the metre: " +
+        "content is placed in the wrong size. mapping edit --scale gives the map its size",
+    );
+  }
   const session = Array.from(sessionFromCamera);
   checkRigid(session);
   return multiply(session, rigidInverse(cameraMatrix(pose, axes)));

@@ -30,6 +30,15 @@ export interface MapInfo {
   tiles: Tile[];
   /** Where the map lies on Earth: a circle around it, metres. Null when it is not anchored. */
   place: { latitude: number; longitude: number; radius: number } | null;
+  /** Photos of the map, each looked for in the map without itself; null where none were. */
+  own_test: { tested: number; localized: number; wrong: number } | null;
+  /** What speaks against the map; at most 16. */
+  doubts: { kind: string; message: string }[];
+  /** `id@version` of other maps of the same build, which nothing links to this one; at most 16. */
+  pieces: string[];
+  /** By id, at most 16 of them: for photos that one of them took. */
+  cameras: Record<string, Camera>;
+  num_cameras: number;
 }
 
 /** One map of a set. */
@@ -87,6 +96,8 @@ interface Estimate {
   uncertainty: "whole" | "photo only";
   /** That the pose is right, 0 to 1; null when it was not judged. */
   probability: number | null;
+  /** Whether the unit of lengths is the metre; false: its length is unknown. */
+  metric: boolean | null;
 }
 
 export interface PoseEstimate extends Estimate {
@@ -117,6 +128,7 @@ export interface CoarsePose {
   position_std: number[];
   orientation_std_deg: number[];
   method: "bdi" | "csi" | "ewb";
+  metric: boolean | null;
 }
 
 /** One of the two places between which an ambiguous photo leaves the choice. */
