@@ -123,6 +123,18 @@ describe("the form of a photo", () => {
     expect((form.get("image") as File).name).toBe('a "b".jpg');
   });
 
+  test.each([
+    ["kitchen", "kitchen", null],
+    [["kitchen@7"], "kitchen@7", null],
+    [["kitchen@7", "hall"], null, '["kitchen@7","hall"]'],
+  ])("names the map or maps %j, and the first of them to a balancer", async (map, one, many) => {
+    const form = localizeForm({ ...CALL, map });
+    expect([form.get("map"), form.get("maps")]).toEqual([one, many]);
+    const asked = answering(() => json({}));
+    await failure(connect(BASE).localize({ ...CALL, map }));
+    expect(asked[0]!.headers.get("X-Visloc-Map")).toBe("kitchen");
+  });
+
   test("names a photo that came without a name", () => {
     expect((localizeForm({ ...CALL, name: "" }).get("image") as File).name).toBe("photo");
   });

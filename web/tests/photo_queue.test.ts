@@ -11,7 +11,7 @@ import { createPhotoQueue, type Entry, type Wish } from "../src/page/photo_queue
 
 const MAP = { id: "kitchen", version: "7", current: true } as MapInfo;
 const ANSWER = { status: "not_localized", debug: null } as LocalizeResponse;
-const wish = (): Wish => ({ map: MAP, camera: null, options: {} });
+const wish = (): Wish => ({ map: MAP, others: [], camera: null, options: {}, debug: true });
 const photo = (...bytes: number[]): Blob => new Blob([new Uint8Array(bytes)]);
 
 function refusal(status: number, wait: number | null): ServiceError {
@@ -65,7 +65,18 @@ describe("photos", () => {
     await until(() => queue.entries.every(({ state }) => state === "answered"));
     expect(names(calls)).toEqual(["a", "b", "c"]);
     expect(seen.most).toBe(1);
-    expect(calls[0]).toMatchObject({ map: "kitchen@7", camera: null, options: {}, debug: true });
+    expect(calls[0]).toMatchObject({ map: ["kitchen@7"], camera: null, options: {}, debug: true });
+  });
+
+  test("are looked for in several maps, and bring their matches only where that is wished", async () => {
+    const { queue, calls } = queueAt([]);
+    queue.add(photo(1), "a", () => ({ ...wish(), others: ["hall", "shed"], debug: false }));
+    await until(() => queue.entries[0]!.state === "answered");
+    expect(calls[0]).toMatchObject({ map: ["kitchen@7", "hall", "shed"], debug: false });
+    const first = queue.entries[0]!;
+    queue.again(first, () => ({ ...first.wish!, debug: true }));
+    await until(() => calls.length === 2 && first.state === "answered");
+    expect(calls[1]).toMatchObject({ map: ["kitchen@7", "hall", "shed"], debug: true });
   });
 
   test("wait as long as a busy service asks, and the ones behind them too", async () => {

@@ -1,6 +1,6 @@
 import { expect, test } from "vitest";
-import type { Candidate, LocalizeResponse } from "visloc-client";
-import { shownPlaces } from "../src/page/shown_pose";
+import type { Candidate, LocalizeResponse, PoseEstimate } from "visloc-client";
+import { isSure, shownPlaces, verdictOf } from "../src/page/shown_pose";
 
 const HALL = { id: "hall", version: "v1" };
 
@@ -19,6 +19,21 @@ function refusedWith(...candidates: Candidate[]): LocalizeResponse {
     camera: { model: "SIMPLE_PINHOLE", width: 4, height: 3, params: [4, 2, 1.5], source: "given" },
   } as unknown as LocalizeResponse;
 }
+
+test.each([
+  [0.98, true, "Localized", ""],
+  [0.9, true, "Localized", ""],
+  [0.85, false, "Perhaps here", "0.85"],
+  [0.42, false, "Perhaps here", "0.42"],
+  [0, false, "Perhaps here", "0.00"],
+  [null, false, "Localized", "did not judge"],
+])("a pose of probability %s is sure: %s", (probability, sure, name, doubt) => {
+  const pose = { probability } as PoseEstimate;
+  expect(isSure(pose)).toBe(sure);
+  expect(verdictOf(pose).name).toBe(name);
+  expect(verdictOf(pose).doubt).toContain(doubt);
+  expect(verdictOf(pose).doubt === "").toBe(sure);
+});
 
 test("both places of an ambiguous photo are drawn, with its camera", () => {
   const places = shownPlaces(refusedWith(candidate(1), candidate(7)));

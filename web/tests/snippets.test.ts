@@ -16,7 +16,7 @@ import {
 
 const PLAIN: Question = {
   server: new URL("http://127.0.0.1:8000/"),
-  map: "kitchen",
+  maps: ["kitchen"],
   photo: "photo.jpg",
   camera: null,
   options: {},
@@ -24,7 +24,7 @@ const PLAIN: Question = {
 };
 const FULL: Question = {
   ...PLAIN,
-  map: "kitchen@20261121T111436.881Z-7f9cafe0",
+  maps: ["kitchen@20261121T111436.881Z-7f9cafe0"],
   camera: { model: "PINHOLE", width: 640, height: 480, params: [525, 525.5, 320, 1e-7] },
   options: { top_k: 5, solver: "poselib" },
 };
@@ -190,10 +190,18 @@ sys.modules["visloc"] = types.SimpleNamespace(Camera=lambda *camera: camera)
     expect(JSON.parse(run.stdout.split("\n")[0]!)).toEqual([
       "http://127.0.0.1:8000",
       photo,
-      FULL.map,
+      FULL.maps[0],
       ["PINHOLE", 640, 480, [525, 525.5, 320, 1e-7]],
       FULL.options,
     ]);
+  });
+
+  test.each([
+    [["kitchen"], "-F map=kitchen", '"photo.jpg", "kitchen")'],
+    [["kitchen", "hall"], "-F maps=kitchen,hall", '"photo.jpg", ["kitchen", "hall"])'],
+  ])("name the maps %j", (maps, curl, python) => {
+    expect(curlLine({ ...PLAIN, maps })).toContain(curl);
+    expect(pythonLines({ ...PLAIN, maps })).toContain(python);
   });
 
   test("fit the signature of the client", () => {

@@ -100,7 +100,8 @@ export function connect(server: string | URL, settings: Settings = {}): Client {
     const given = typeof apiKey === "function" ? apiKey() : apiKey;
     if (given !== null) headers.set("Authorization", `Bearer ${given}`);
     // A balancer sends the requests of a map to the server that has it open.
-    if (request.map !== undefined) headers.set("X-Visloc-Map", request.map.split("@")[0] ?? "");
+    const first = typeof request.map === "string" ? request.map : request.map?.[0];
+    if (first !== undefined) headers.set("X-Visloc-Map", first.split("@")[0] ?? "");
     if (timeoutSeconds !== null) headers.set("X-Request-Timeout", String(timeoutSeconds));
     if (request.accept !== undefined) headers.set("Accept", request.accept);
     const form = request.form?.();
@@ -271,7 +272,7 @@ export function connect(server: string | URL, settings: Settings = {}): Client {
 
 /** One request, which may be sent twice: a form is made for each time. */
 interface Asking {
-  map?: string;
+  map?: string | string[];
   form?: () => FormData;
   /** The caller's. */
   signal: AbortSignal | null;

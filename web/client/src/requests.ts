@@ -61,8 +61,11 @@ export interface Priors {
 
 /** Where to look, and how: the fields of docs/api.md. */
 interface Where {
-  /** An id or `id@version`. */
-  map: string;
+  /**
+   * An id or `id@version`; or at most 16 that are all searched: one of them answers, and `map` of
+   * the answer says which. A photo that fits two of them is refused.
+   */
+  map: string | string[];
   options?: Record<string, string | number>;
   priors?: Priors;
 }
@@ -109,10 +112,18 @@ export interface SequenceCall extends Where {
   max_gap_s?: number;
 }
 
+/** The API has one field for a map and another for several. */
+function whereOf({ map }: Where): { map: string | undefined; maps?: string[] } {
+  if (typeof map === "string") return { map };
+  return map.length === 1 ? { map: map[0] } : { map: undefined, maps: map };
+}
+
 /** The form of POST /localize. What was not chosen is not sent: the service has defaults. */
 export function localizeForm(call: LocalizeCall): FormData {
   const form = new FormData();
-  form.set("map", call.map);
+  const { map, maps } = whereOf(call);
+  if (map !== undefined) form.set("map", map);
+  if (maps !== undefined) form.set("maps", JSON.stringify(maps));
   if (call.image !== undefined) form.set("image", blobOf(call.image), call.name || "photo");
   if (call.mask !== undefined) form.set("mask", blobOf(call.mask), "mask");
   if (call.features !== undefined) {
@@ -131,7 +142,8 @@ export function localizeForm(call: LocalizeCall): FormData {
 /** The form of POST /localize/rig: a text `request`, and a file for each photo and mask. */
 export function rigForm(call: RigCall): FormData {
   const form = new FormData();
-  form.set("request", JSON.stringify({ ...call, images: withParts(call.images, form) }));
+  const images = withParts(call.images, form);
+  form.set("request", JSON.stringify({ ...call, ...whereOf(call), images }));
   return form;
 }
 
@@ -142,7 +154,7 @@ export function sequenceForm(call: SequenceCall): FormData {
     ...instant,
     images: withParts(instant.images, form),
   }));
-  form.set("request", JSON.stringify({ ...call, instants }));
+  form.set("request", JSON.stringify({ ...call, ...whereOf(call), instants }));
   return form;
 }
 

@@ -12,7 +12,7 @@ import { copyText, textsToCopy } from "./copying";
 import type { Entry } from "./photo_queue";
 import { photoPicture } from "./photo_picture";
 import { advice, outcomes, STAGES } from "./refusals";
-import { covarianceOfPosition, shownPlaces } from "./shown_pose";
+import { covarianceOfPosition, isSure, shownPlaces, verdictOf } from "./shown_pose";
 import { poseLink } from "./share";
 import { answerJson, curlLine, pythonLines, type Question } from "./snippets";
 import { headingText, positionText } from "../earth";
@@ -22,7 +22,6 @@ const IN_FOLDER = "To be run in the folder of the photo.";
 const LINK = "Opens this page at the pose. The photo is not in it.";
 
 export interface AnswerActions {
-  metric: boolean;
   options: Record<string, string | number>;
   question: Question;
   /** Choose the map that the answer is of; null when it is the one that is shown. */
@@ -33,6 +32,8 @@ export interface AnswerActions {
   /** Look at a candidate in the 3D view, by its row; null when another map is shown. */
   lookAt: ((place: number) => void) | null;
   takeCamera(): void;
+  /** Ask again for the matches; null where the answer has them. */
+  fetchMatches: (() => void) | null;
   again(): void;
 }
 
@@ -47,10 +48,19 @@ export function answerView(
     "div",
     { class: "stack answer" },
     ...(actions.chooseMap === null ? [] : [ofAnotherMap(answer, actions.chooseMap)]),
-    pose === null ? refused(answer, actions) : localized(answer, pose, actions.metric),
+    pose === null ? refused(answer, actions) : localized(answer, pose),
     ...candidateList(answer, actions),
     photoPicture(entry.photo, answer),
-    ...(pose === null ? [] : [poseTable(pose, actions.metric)]),
+    ...(actions.fetchMatches === null
+      ? []
+      : [
+          element(
+            "div",
+            { class: "row" },
+            button("Show the matches (about 1 MB)", actions.fetchMatches),
+          ),
+        ]),
+    ...(pose === null ? [] : [poseTable(pose)]),
     ...earthSection(answer.geopose),
     section(
       refusal === null ? "What it rests on" : "What was found",
@@ -101,7 +111,7 @@ function ofAnotherMap({ map }: LocalizeResponse, choose: () => void): HTMLElemen
 /** One line about an answer, for lists and for those who do not see it. */
 export function inShort(answer: LocalizeResponse): string {
   return answer.pose !== null
-    ? `localized, ${countText(answer.inliers)} inliers`
+    ? `${verdictOf(answer.pose).name.toLowerCase()}, ${countText(answer.inliers)} inliers`
     : `${answer.coarse ? "coarse" : "not localized"}: ${answer.refusal?.message ?? ""}`;
 }
 
@@ -114,12 +124,15 @@ const COVERED = {
 };
 const FOOLED = "Look-alike places, prints, mirrors and a wrong camera can fool it.";
 
-function localized(answer: LocalizeResponse, pose: PoseEstimate, metric: boolean): HTMLElement {
+function localized(answer: LocalizeResponse, pose: PoseEstimate): HTMLElement {
+  const { name, doubt } = verdictOf(pose);
+  const metric = pose.metric === true;
   const std = ellipsoid95(covarianceOfPosition(pose)).halfAxes[0] / REACH_95;
   return element(
     "div",
-    { class: "verdict good" },
-    element("h2", {}, "Localized"),
+    { class: `verdict ${doubt === "" ? "good" : "unsure"}` },
+    element("h2", {}, name),
+    ...(doubt === "" ? [] : [element("p", {}, doubt)]),
     element(
       "p",
       {},
@@ -130,7 +143,7 @@ function localized(answer: LocalizeResponse, pose: PoseEstimate, metric: boolean
   );
 }
 
-function refused(answer: LocalizeResponse, { options, metric }: AnswerActions): HTMLElement {
+function refused(answer: LocalizeResponse, { options }: AnswerActions): HTMLElement {
   const { meaning, tries } = advice(answer, options);
   const states = outcomes(answer);
   const said = { passed: "passed", stopped: "stopped here", not_reached: "not reached" };
@@ -147,7 +160,7 @@ function refused(answer: LocalizeResponse, { options, metric }: AnswerActions): 
     { class: "verdict unsure stack near" },
     element("h2", {}, "The map says: I do not know."),
     element("ol", { class: "pipeline", "aria-label": "How far the photo came" }, ...steps),
-    ...(answer.coarse ? [element("p", {}, coarseWords(answer.coarse, metric))] : []),
+    ...(answer.coarse ? [element("p", {}, coarseWords(answer.coarse))] : []),
     element("p", {}, meaning),
     element(
       "p",
@@ -160,11 +173,11 @@ function refused(answer: LocalizeResponse, { options, metric }: AnswerActions): 
 }
 
 /** What a coarse pose is worth, whose ellipsoid the 3D view draws. */
-function coarseWords(coarse: CoarsePose, metric: boolean): string {
+function coarseWords(coarse: CoarsePose): string {
   const [reach] = ellipsoid95(covarianceOfPosition(coarse)).halfAxes;
   return (
     "Coarse: the most similar mapping photos were taken about here. Nothing confirms it; with 95 % " +
-    `the photo was taken within the ellipsoid that is drawn, at most ${lengthText(reach, metric, 2)} away.`
+    `the photo was taken within the ellipsoid that is drawn, at most ${lengthText(reach, coarse.metric === true, 2)} away.`
   );
 }
 
@@ -215,7 +228,8 @@ export function earthSection(geopose: GeoPose | null): HTMLElement[] {
   return [section("On Earth", facts(rows))];
 }
 
-function poseTable(pose: PoseEstimate, metric: boolean): HTMLElement {
+function poseTable(pose: PoseEstimate): HTMLElement {
+  const metric = pose.metric === true;
   const row = (name: string, unit: string, values: string[]): HTMLElement =>
     element(
       "tr",
@@ -290,7 +304,8 @@ function cameraWords(answer: LocalizeResponse, actions: AnswerActions): HTMLElem
     {},
     `${model} ${width} × ${height}: ${numbers}`,
     element("div", { class: "quiet" }, CAMERA_SOURCES[source] ?? source),
-    ...(source === "given"
+    // The camera of a doubtful pose may be as wrong as the pose.
+    ...(source === "given" || answer.pose === null || !isSure(answer.pose)
       ? []
       : [button("Use as typed camera", actions.takeCamera, { class: "link" })]),
   );

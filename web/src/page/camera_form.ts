@@ -1,4 +1,4 @@
-// The camera of a photo: told by its EXIF, or typed.
+// The camera of a photo: told by its EXIF, one of the map's own, or typed.
 import { cameraText, type Camera } from "visloc-client";
 import { element, field } from "../dom";
 import {
@@ -16,6 +16,8 @@ export interface CameraForm {
   camera(): Camera | null;
   /** Take over a camera, as of an answer. */
   set(camera: Camera): void;
+  /** Those that the mapping photos were taken by, by id: of the map that is shown now. */
+  offer(cameras: Readonly<Record<string, Camera>>): void;
   /** Photos were sent: unless it is to be kept, the next ones speak for themselves. */
   sent(): void;
   /** The size of the photo, for fields that nobody filled. */
@@ -26,6 +28,11 @@ export interface CameraForm {
 export function createCameraForm(): CameraForm {
   const fromExif = element("input", { type: "radio", name: "camera", checked: true });
   const typing = element("input", { type: "radio", name: "camera" });
+  const ofMap = element("input", { type: "radio", name: "camera" });
+  const ofMapLabel = element("label", { class: "check" }, ofMap, "Of the map");
+  const choice = element("select", { id: "camera-of-map" });
+  const choiceField = field("A camera that took mapping photos", choice);
+  let offered: Readonly<Record<string, Camera>> = {};
   const model = element("select", { id: "camera-model" });
   model.append(...Object.keys(CAMERA_MODELS).map((name) => element("option", {}, name)));
   model.value = "PINHOLE";
@@ -64,8 +71,10 @@ export function createCameraForm(): CameraForm {
         { class: "row" },
         element("legend", { class: "unseen" }, "Where the camera’s parameters come from"),
         element("label", { class: "check" }, fromExif, "From the photo’s EXIF"),
+        ofMapLabel,
         element("label", { class: "check" }, typing, "Typed"),
       ),
+      choiceField,
       form,
     ),
   );
@@ -102,12 +111,14 @@ export function createCameraForm(): CameraForm {
   /** Say what will be sent, and mark what is wrong of what was typed already. */
   function changed(): void {
     form.hidden = !typing.checked;
+    choiceField.hidden = !ofMap.checked;
     const faults = cameraFaults(typed());
     for (const { input } of [width, height, ...fields]) {
       const wrong = input.value.trim() !== "" && faults.some(({ field }) => field === input.name);
       input.setAttribute("aria-invalid", String(wrong));
     }
-    if (!typing.checked) summary.textContent = "from the photo’s EXIF";
+    if (ofMap.checked) summary.textContent = `of the map: ${choice.value}`;
+    else if (!typing.checked) summary.textContent = "from the photo’s EXIF";
     else if (faults.length > 0) summary.textContent = `typed, ${faults[0]!.field} is missing`;
     else summary.textContent = cameraText(cameraOf(typed()));
     if (faults.length === 0 && document.activeElement !== text) {
@@ -139,12 +150,31 @@ export function createCameraForm(): CameraForm {
 
   return {
     element: details,
-    camera: () => (typing.checked ? cameraOf(typed()) : null),
+    camera: () => {
+      if (ofMap.checked) return offered[choice.value] ?? null;
+      return typing.checked ? cameraOf(typed()) : null;
+    },
     set(camera) {
       typing.checked = true;
       const { width: w, height: h, params: numbers } = camera;
       show({ model: camera.model, width: `${w}`, height: `${h}`, params: numbers.map(String) });
       details.open = true;
+      changed();
+    },
+    offer(cameras) {
+      const before = choice.value;
+      offered = cameras;
+      const ids = Object.keys(cameras).sort();
+      choice.replaceChildren(
+        ...ids.map((id) => {
+          const { model, width, height } = cameras[id]!;
+          return element("option", { value: id }, `${id}: ${model} ${width} × ${height}`);
+        }),
+      );
+      ofMapLabel.hidden = ids.length === 0;
+      if (ids.includes(before)) choice.value = before;
+      // A camera of another map is none of this one.
+      else if (ofMap.checked) fromExif.checked = true;
       changed();
     },
     sent() {

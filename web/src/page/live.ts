@@ -15,6 +15,7 @@ import { LiveSession } from "./live_session";
 import { Trail } from "./live_trail";
 import { WalkView } from "./live_view";
 import { sentence } from "./problem_view";
+import { isSure, verdictOf } from "./shown_pose";
 import "../style/live.css";
 
 export interface LiveState {
@@ -134,7 +135,7 @@ export function createLive(host: HTMLElement, context: PageContext): Live {
     if (answer.pose === null) prior.refused();
     else prior.localized(answer.pose.position, frame.atMs);
     view.show(answer, panel.follow.checked);
-    session.say(answerInWords(answer, context.map()?.metric ?? true));
+    session.say(answerInWords(answer));
     const outcome = panel.status.textContent;
     if (outcome !== announced.outcome && now - announced.at > ANNOUNCE_EVERY_MS) {
       announced = { outcome, at: now };
@@ -167,7 +168,8 @@ export function createLive(host: HTMLElement, context: PageContext): Live {
     if (!session.running) return ["off", "Paused"];
     if (failing) return ["failed", "No answer"];
     if (last === null) return ["off", "Starting"];
-    return last.pose === null ? ["refused", "I do not know"] : ["localized", "Localized"];
+    if (last.pose === null) return ["refused", "I do not know"];
+    return [isSure(last.pose) ? "localized" : "doubtful", verdictOf(last.pose).name];
   }
 
   function drawFigures(): void {
@@ -299,12 +301,15 @@ export function createLive(host: HTMLElement, context: PageContext): Live {
 }
 
 /** Why there is no pose, or how good it is. */
-function answerInWords(
-  { pose, refusal, inliers, correspondences, geopose }: LocalizeResponse,
-  metric: boolean,
-): string {
+function answerInWords({
+  pose,
+  refusal,
+  inliers,
+  correspondences,
+  geopose,
+}: LocalizeResponse): string {
   if (pose === null) return sentence(refusal?.message ?? "no reason was given");
-  const std = lengthText(Math.hypot(...pose.position_std), metric, 2);
+  const std = lengthText(Math.hypot(...pose.position_std), pose.metric === true, 2);
   const alone = pose.uncertainty === "photo only" ? " by scatter alone" : "";
   const sure = pose.probability === null ? "" : ` Probability ${pose.probability.toFixed(2)}.`;
   const agree = `${countText(inliers)} of ${countText(correspondences)} matches agree.`;

@@ -68,6 +68,7 @@ const mapListeners: ((map: MapInfo | null) => void)[] = [];
 const photos = createPhotoPanel(byId("panel-photo", HTMLElement), {
   ...{ service, server, viewer, announce },
   map: () => shownMap,
+  maps: () => choice.maps,
   hasKey: () => key.current() !== null,
   askForKey,
   chooseMap: (ref) => choice.choose(ref),

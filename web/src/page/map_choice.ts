@@ -12,6 +12,8 @@ export type Choice =
   | { kind: "map"; map: MapInfo };
 
 export interface MapChoice {
+  /** All that the service listed. */
+  readonly maps: readonly MapInfo[];
   /** Choose a map: an id or `id@version`. */
   choose(ref: string): void;
   /** Ask for the list again, and keep the choice where it still exists. */
@@ -118,7 +120,13 @@ export function createMapChoice(
     if (maps.length === 0) reload();
     else void choose(ref);
   });
-  return { choose: (ref) => void choose(ref), reload };
+  return {
+    get maps() {
+      return maps;
+    },
+    choose: (ref) => void choose(ref),
+    reload,
+  };
 }
 
 /** `#map=id` or `#map=id@version`. */

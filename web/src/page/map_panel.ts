@@ -102,6 +102,9 @@ export function createMapPanel(host: HTMLElement, viewer: Viewer, theme: Theme):
       about.replaceChildren(
         element("h2", {}, map.id),
         element("p", {}, "Drop or paste a photo anywhere to see where it was taken."),
+        ...map.doubts.map(({ message }) =>
+          element("p", { class: "note" }, `What speaks against this map: ${message}.`),
+        ),
         numbers,
         element("p", { class: "quiet small", hidden: shownTiles(map) === "" }, shownTiles(map)),
         element(
@@ -180,7 +183,17 @@ function mapFacts(map: MapInfo, extent: Vector3 | null): HTMLElement {
   if (extent !== null) {
     const sides = extent.map((side) => lengthText(side, map.metric)).join(" × ");
     const name = shownTiles(map) === "" ? "Extent" : "Extent shown";
-    rows.push([name, `${sides}${map.metric ? "" : " (not metric)"}`]);
+    const unit = map.metric ? "" : " units of unknown length";
+    rows.push([name, `${sides}${unit}, cameras included, without the outermost landmarks`]);
+  }
+  if (map.own_test !== null) {
+    const { tested, localized, wrong } = map.own_test;
+    const words = `${countText(localized - wrong)} of ${counted(tested, "photo")} came back where they were`;
+    rows.push(["Own test", wrong === 0 ? words : `${words}, ${countText(wrong)} elsewhere`]);
+  }
+  if (map.pieces.length > 0) {
+    const pieces = map.pieces.map((ref) => ref.split("@")[0]).join(", ");
+    rows.push(["Other pieces", `${pieces}: photos that nothing links to these`]);
   }
   if (map.place !== null) {
     const { latitude, longitude } = map.place;

@@ -13,12 +13,13 @@ import type { ShownPose, Viewer } from "../viewer/types";
 import { answerView, inShort } from "./answer_view";
 import { createCameraForm } from "./camera_form";
 import { jpegHeader } from "./jpeg_header";
+import { createMapsForm } from "./maps_form";
 import { createOptionsForm } from "./options_form";
 import { createPhotoQueue, questionOf, type Entry, type Wish } from "./photo_queue";
 import { problemView } from "./problem_view";
 import type { SharedPose } from "./share";
 import { damagedLink, sharedView } from "./shared_view";
-import { shownPlaces } from "./shown_pose";
+import { isSure, shownPlaces } from "./shown_pose";
 import { countText } from "../words";
 
 export interface PhotoPanelParts {
@@ -26,6 +27,8 @@ export interface PhotoPanelParts {
   server: URL;
   viewer: Viewer;
   map(): MapInfo | null;
+  /** All that the service lists. */
+  maps(): readonly MapInfo[];
   hasKey(): boolean;
   /** Ask for another API key than the one that was refused so. */
   askForKey(problem: Problem): void;
@@ -65,6 +68,7 @@ export function createPhotoPanel(host: HTMLElement, parts: PhotoPanelParts): Pho
   const { viewer, announce } = parts;
   const camera = createCameraForm();
   const options = createOptionsForm(parts.service);
+  const maps = createMapsForm();
   const list = element("ul", { class: "photos" });
   const listHead = element("h2", { class: "small" });
   const listing = element("section", { class: "stack near", hidden: true });
@@ -118,7 +122,7 @@ export function createPhotoPanel(host: HTMLElement, parts: PhotoPanelParts): Pho
         element("label", { for: "photo-files", class: "button primary" }, "Choose photos"),
         element("p", { class: "quiet" }, "or drop or paste them"),
       ),
-      element("div", { class: "settings" }, camera.element, options.element),
+      element("div", { class: "settings" }, camera.element, maps.element, options.element),
       listing,
       shown,
     ),
@@ -129,7 +133,10 @@ export function createPhotoPanel(host: HTMLElement, parts: PhotoPanelParts): Pho
     if (map === null) {
       throw ownError("page.map", "No map is chosen", "choose a map first");
     }
-    return { map, camera: camera.camera(), options: options.options() };
+    return {
+      ...{ map, others: maps.others(), debug: !sparesData() },
+      ...{ camera: camera.camera(), options: options.options() },
+    };
   }
 
   function add(photos: { photo: Blob; name: string }[]): void {
@@ -184,10 +191,10 @@ export function createPhotoPanel(host: HTMLElement, parts: PhotoPanelParts): Pho
     if (fly) flyTo(0);
   }
 
-  function again(entry: Entry): void {
+  function again(entry: Entry, wanted: () => Wish = wish): void {
     startDrawing();
     selected = entry;
-    queue.again(entry, wish);
+    queue.again(entry, wanted);
   }
 
   function clear(): void {
@@ -253,10 +260,9 @@ export function createPhotoPanel(host: HTMLElement, parts: PhotoPanelParts): Pho
   function fill(entry: Entry, fly: boolean): void {
     const { answer, error } = entry;
     if (answer !== null && entry.wish !== null) {
-      const { map } = entry.wish;
+      const asked = entry.wish;
       shown.replaceChildren(
         answerView(entry, answer, {
-          metric: map.metric,
           options: entry.wish.options,
           chooseMap: isShown(answer) ? null : () => parts.chooseMap(mapRef(answer.map)),
           question: questionOf(entry, entry.wish, parts.server),
@@ -275,6 +281,8 @@ export function createPhotoPanel(host: HTMLElement, parts: PhotoPanelParts): Pho
             camera.set({ model, width, height, params });
             announce("The camera of this answer is used for what is asked from now on");
           },
+          fetchMatches:
+            answer.debug === null ? () => again(entry, () => ({ ...asked, debug: true })) : null,
           again: () => again(entry),
         }),
       );
@@ -322,6 +330,8 @@ export function createPhotoPanel(host: HTMLElement, parts: PhotoPanelParts): Pho
     options: options.options,
     add,
     mapChanged() {
+      camera.offer(parts.map()?.cameras ?? {});
+      maps.fill(parts.maps(), parts.map());
       if (shared !== null) fillShared(shared, false);
       else if (selected !== null) show(selected, false);
     },
@@ -370,11 +380,19 @@ function retrievedOf(answer: LocalizeResponse): Set<string> {
   return new Set(answer.retrieved.map(({ image }) => image));
 }
 
-type Outcome = "waiting" | "running" | "localized" | "refused" | "failed";
+/** A phone, or whoever asks to save data, gets no megabyte that nobody wished for. */
+function sparesData(): boolean {
+  const { connection } = navigator as { connection?: { saveData?: boolean } };
+  return connection?.saveData === true || matchMedia("(pointer: coarse)").matches;
+}
+
+type Outcome = "waiting" | "running" | "localized" | "doubtful" | "refused" | "failed";
 
 function outcome(entry: Entry): Outcome {
   if (entry.state !== "answered") return entry.state;
-  return entry.answer?.status === "localized" ? "localized" : "refused";
+  const pose = entry.answer?.pose ?? null;
+  if (pose === null) return "refused";
+  return isSure(pose) ? "localized" : "doubtful";
 }
 
 function stateWords(entry: Entry): string {
@@ -385,7 +403,9 @@ function stateWords(entry: Entry): string {
     refused: "not localized",
   };
   const state = outcome(entry);
-  return state === "localized" ? `${countText(entry.answer!.inliers)} inliers` : words[state];
+  const inliers = `${countText(entry.answer?.inliers ?? 0)} inliers`;
+  if (state === "localized") return inliers;
+  return state === "doubtful" ? `in doubt, ${inliers}` : words[state];
 }
 
 function waiting(entry: Entry): HTMLElement {

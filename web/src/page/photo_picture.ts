@@ -57,7 +57,9 @@ export function photoPicture(photo: Blob, answer: LocalizeResponse): HTMLElement
   const canvas = element("canvas", { tabindex: 0, role: "img" });
   canvas.setAttribute(
     "aria-label",
-    `The photo with its ${answer.inliers} inliers; plus, minus and arrows move in it`,
+    answer.debug === null
+      ? "The photo; plus, minus and arrows move in it"
+      : `The photo with its ${answer.inliers} inliers; plus, minus and arrows move in it`,
   );
   canvas.style.aspectRatio = `${size.width} / ${size.height}`;
   let bitmap: ImageBitmap | null = null;
@@ -227,7 +229,7 @@ export function photoPicture(photo: Blob, answer: LocalizeResponse): HTMLElement
     element("div", { class: "canvas-place" }, canvas, tools),
     element(
       "div",
-      { class: "row" },
+      { class: "row", hidden: answer.debug === null },
       element(
         "label",
         { class: "check inliers" },

@@ -16,6 +16,10 @@ import { shortRef } from "../words";
 /** What is asked about a photo, as it was chosen when the photo came. */
 export interface Wish {
   map: MapInfo;
+  /** Ids of maps that are searched beside it. */
+  others: string[];
+  /** Whether the answer brings the matches and a picture of them: about a megabyte. */
+  debug: boolean;
   camera: Camera | null;
   options: Record<string, string | number>;
 }
@@ -154,8 +158,8 @@ async function read(entry: Entry) {
     });
   }
   entry.photo = new Blob([bytes], { type: entry.photo.type });
-  const { map, camera, options } = wish;
-  return { map: mapRef(map), image: entry.photo, name, camera, options, debug: true };
+  const { map, others, camera, options, debug } = wish;
+  return { map: [mapRef(map), ...others], image: entry.photo, name, camera, options, debug };
 }
 
 function keep(entry: Entry, answer: LocalizeResponse): void {
@@ -185,7 +189,7 @@ function jpegOf(base64: string): Blob {
 
 /** What was asked, for those who want to ask it themselves. */
 export function questionOf(entry: Entry, wish: Wish, server: URL): Question {
-  const { camera, options, map } = wish;
-  const photo = entry.name;
-  return { server, map: shortRef(map), photo, camera, options, withKey: entry.withKey };
+  const { camera, options, map, others } = wish;
+  const maps = [shortRef(map), ...others];
+  return { server, maps, photo: entry.name, camera, options, withKey: entry.withKey };
 }

@@ -10,6 +10,29 @@ import {
 import { positionCovariance, type Matrix3 } from "../geometry";
 import type { ShownPose } from "../viewer/types";
 
+/** A pose of less probability is in doubt (docs/trust.md). */
+const SURE = 0.9;
+
+/** Whether the service takes the pose for right; it may also not have judged it. */
+export function isSure({ probability }: PoseEstimate): boolean {
+  return probability !== null && probability >= SURE;
+}
+
+/** What a pose is called, and why it is in doubt where it is. */
+export function verdictOf(pose: PoseEstimate): { name: string; doubt: string } {
+  if (isSure(pose)) return { name: "Localized", doubt: "" };
+  if (pose.probability === null) {
+    return { name: "Localized", doubt: "The service did not judge whether this place is right." };
+  }
+  const chance = pose.probability.toFixed(2);
+  return {
+    name: "Perhaps here",
+    doubt:
+      `The place is in doubt: the probability that it is right is ${chance}. A place that looks ` +
+      "alike, or another camera than was assumed, answers like this.",
+  };
+}
+
 /** The pose with its ellipsoid, and the inliers where they were asked for; null of a refusal. */
 export function shownPose({ pose, camera, debug }: LocalizeResponse): ShownPose | null {
   if (pose === null) return null;

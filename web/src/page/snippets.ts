@@ -5,8 +5,8 @@ import { cameraText, type Camera, type LocalizeResponse } from "visloc-client";
 export interface Question {
   /** Address of the service; ends in a slash. */
   server: URL;
-  /** An id or `id@version`. */
-  map: string;
+  /** Each an id or `id@version`. */
+  maps: string[];
   /** Name of the photo's file. A browser does not tell its folder. */
   photo: string;
   camera: Camera | null;
@@ -32,7 +32,8 @@ export function curlLine(question: Question): string {
   // Double quotes, so that the shell puts the key in.
   if (question.withKey) parts.push('-H "Authorization: Bearer $VISLOC_API_KEY"');
   parts.push(`-F ${shellQuoted(`image=@${curlFile(question.photo)}`)}`);
-  parts.push(curlText("map", question.map));
+  const [map = "", ...others] = question.maps;
+  parts.push(curlText(others.length > 0 ? "maps" : "map", [map, ...others].join(",")));
   if (question.camera !== null) parts.push(curlText("camera", cameraText(question.camera)));
   if (Object.keys(question.options).length > 0) {
     parts.push(curlText("options", JSON.stringify(question.options)));
@@ -47,7 +48,9 @@ export function pythonLines(question: Question): string {
   const base = question.server.href.replace(/\/$/, "");
   const server = [pythonText(base)];
   if (question.withKey) server.push('api_key=os.environ["VISLOC_API_KEY"]');
-  const asked = [pythonText(question.photo), pythonText(question.map)];
+  const [map = "", ...others] = question.maps.map(pythonText);
+  const where = others.length > 0 ? `[${[map, ...others].join(", ")}]` : map;
+  const asked = [pythonText(question.photo), where];
   const hasOptions = Object.keys(options).length > 0;
   if (camera !== null) asked.push("camera");
   if (hasOptions) asked.push(camera === null ? "options=options" : "options");
