@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 from urllib.parse import urlsplit
@@ -21,8 +21,11 @@ import pytest
 
 from mapping.cli.report import write_report
 from mapping.frames.georeference import given_place, publish_anchored
+from mapping.maps.editing import content_of
+from mapping.own_test.publishing import publish_edited
 from tests.serving import ENVIRONMENT, serving
 from visloc.archive import MapStore
+from visloc.archive.schema import PIECES, Doubt
 from visloc.evaluation import pose_error
 from visloc.geometry import Camera, Pose
 from visloc.options import Solver
@@ -274,6 +277,43 @@ def test_a_photo_of_another_place_is_refused_in_words_with_what_to_try(
     assert seen["view"].keys() == seen["before"].keys()
     for name, before in seen["before"].items():
         assert seen["view"][name] == pytest.approx(before, abs=1e-9)
+
+
+@pytest.mark.slow
+def test_a_phone_asks_several_maps_and_fetches_matches_only_when_asked(
+    browser: Browser, built_maps: Path, queries: list[Query], tmp_path: Path
+) -> None:
+    store = MapStore(shutil.copytree(built_maps, tmp_path / "maps"))
+    opened, first = store.open("room"), filmed(queries)[0]
+    content = content_of(opened)
+    folder = publish_edited(store, content, "room-2")
+    settings = {**content.settings, PIECES: [f"room-2@{folder.name}"]}
+    doubt = Doubt(kind="order", message="the path of a film jumps")
+    publish_edited(
+        store, replace(content, settings=settings), "room", carried=(doubt,), accept=True
+    )
+    camera = next(id_ for id_, camera in opened.cameras.items() if camera == first.camera)
+    photo = {"path": str(first.path), "name": "photo.jpg", "way": "chosen"}
+
+    with serving(store.root, tmp_path / "log") as url:
+        seen = browser.see("phone", url=url, camera=camera, photo=photo)
+
+    assert_is_quiet(seen)
+    for words in ("What speaks against this map: the path of a film jumps.", "Own test", "room-2"):
+        assert words in seen["about"]
+    assert "cameras included" in seen["about"]
+    assert seen["chosen"]
+    assert seen["inBoth"]["answer"]["refusal"]["reason"] == "ambiguous"
+    answer = seen["inOne"]["answer"]
+    assert_is_at(answer, first.cam_from_world)
+    assert answer["camera"]["source"] == "given"
+    assert answer["debug"] is None
+    assert seen["inBoth"]["answer"]["debug"] is None
+    assert "Show the matches" in seen["shown"]
+    assert seen["green"] == (answer["pose"]["probability"] >= 0.9)
+    assert seen["matches"] > 100
+    assert seen["again"] == 0
+    assert seen["width"] == 390
 
 
 def test_names_are_text_whatever_they_hold(browser: Browser, query: Query) -> None:
