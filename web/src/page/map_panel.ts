@@ -183,7 +183,7 @@ function mapFacts(map: MapInfo, extent: Vector3 | null): HTMLElement {
   if (extent !== null) {
     const sides = extent.map((side) => lengthText(side, map.metric)).join(" × ");
     const name = shownTiles(map) === "" ? "Extent" : "Extent shown";
-    const unit = map.metric ? "" : " units of unknown length";
+    const unit = map.metric ? "" : " (not metric)";
     rows.push([name, `${sides}${unit}, cameras included, without the outermost landmarks`]);
   }
   if (map.own_test !== null) {
