@@ -17,20 +17,11 @@ from visloc_api.words.answers import (
 )
 from visloc_api.words.answers import MapRef as MapVersion
 from visloc_api.words.geopose import GeoPose, GeoPoseYpr
-from visloc_api.words.maps import (
-    Anchor,
-    Doubt,
-    GeoCircle,
-    Geodetic,
-    MapInfo,
-    OwnTest,
-    RigInfo,
-    VersionInfo,
-)
+from visloc_api.words.maps import Anchor, GeoCircle, Geodetic, MapInfo, RigInfo, VersionInfo
 from visloc_api.words.maps import Tile as TileInfo
 from visloc_api.words.options import LocalizeOptions
 from visloc_api.words.poses import PoseEstimate, RigPose
-from visloc_api.words.scenes import MapCamera, MapImage, MapImages
+from visloc_api.words.scenes import MapImages
 
 __all__ = [
     "Anchor",
@@ -39,7 +30,6 @@ __all__ = [
     "CameraUsed",
     "Client",
     "Debug",
-    "Doubt",
     "Features",
     "GeoCircle",
     "GeoPose",
@@ -53,8 +43,6 @@ __all__ = [
     "InstantResult",
     "LocalizeOptions",
     "LocalizeResult",
-    "MapCamera",
-    "MapImage",
     "MapImages",
     "MapInfo",
     "MapVersion",
@@ -62,7 +50,6 @@ __all__ = [
     "Near",
     "Odometry",
     "Orientation",
-    "OwnTest",
     "PoseEstimate",
     "PosePrior",
     "PoseSource",

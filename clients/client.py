@@ -32,6 +32,7 @@ from clients.wire.features import PhotoOrFeatures
 from clients.wire.requests import (
     CheckReady,
     DeleteVersion,
+    GetImages,
     GetServer,
     GetVersion,
     JsonObject,
@@ -43,7 +44,6 @@ from clients.wire.requests import (
     check_time_unit,
     checked_search,
     checked_version,
-    get_images_request,
     get_map_request,
     instant_words,
     photo_request,
@@ -58,7 +58,7 @@ from visloc.types import Near
 from visloc_api.words import sequences
 from visloc_api.words.maps import MapInfo
 from visloc_api.words.options import LocalizeOptions
-from visloc_api.words.scenes import IMAGES_PAGE, MapImages
+from visloc_api.words.scenes import MapImages
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -223,18 +223,19 @@ class AsyncClient:
         """Describe one map, ``id`` or ``id@version``."""
         return await self._ask(get_map_request(map), answers.parse_map)
 
-    async def images(self, map: str, first: int = 0, count: int = IMAGES_PAGE) -> MapImages:
-        """Tell where photos of a map, ``id`` or ``id@version``, were taken, and by which cameras.
+    async def images(self, map: str, first: int = 0, count: int = 1000) -> MapImages:
+        """Tell where photos of a map were taken, and by which cameras; over HTTP only.
 
         ``images.cameras[id].camera`` is what to send with a photo that this camera took: it is more
         exact than EXIF.
 
         Args:
-            map: not a set: its photos belong to its tiles.
+            map: ``id`` or ``id@version``; not a set, whose photos belong to its tiles.
             first: place in the map's order to begin at; ``images.total`` says how many there are.
             count: most photos, 1 to 10 000.
         """
-        return await self._ask(get_images_request(map, first, count), answers.parse_images)
+        asked = GetImages(get_map_request(map).map, first, count)
+        return await self._ask(asked, MapImages.model_validate)
 
     async def map_version(self, map_id: str, version: str) -> MapInfo:
         """Describe a version of a map, current or not."""

@@ -46,6 +46,13 @@ def print_map(console: Console, info: MapInfo) -> None:
         f"{info.images} photos, {info.landmarks} landmarks, {seen}{_size(info.size_bytes)}",
     )
     print_line(console, "extent", f"{sides} {unit}")
+    if (test := info.own_test) is not None:
+        right = f"{test.localized - test.wrong} of {test.tested} photos came back where they were"
+        print_line(console, "own test", f"{right}, {test.wrong} elsewhere")
+    for doubt in info.doubts:
+        print_line(console, "doubt", doubt.message, "yellow")
+    if info.pieces:
+        print_line(console, "pieces", ", ".join(info.pieces))
     print_line(console, "on Earth", _place(info) or "not known; mapping anchor tells it")
     if info.anchor is not None:
         print_line(console, "anchor", _anchor(info.anchor))

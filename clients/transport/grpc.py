@@ -38,7 +38,7 @@ from clients.wire.requests import (
     StartSequence,
     UseVersion,
 )
-from visloc.errors import VislocError
+from visloc.errors import VislocError, refuse
 from visloc_api.v1 import localization_pb2 as wire
 from visloc_api.words.rigs import LocalizeRigRequest
 from visloc_api.words.sequences import Instant
@@ -193,8 +193,8 @@ def _encode(request: Request) -> tuple[str, bytes, _Decode]:
             message = wire.GetMapRequest(map=request.map).SerializeToString()
             return f"{_SERVICE}/GetMap", message, _reads(wire.MapInfo)
         case GetImages():
-            asked = wire.GetImagesRequest(map=request.map, first=request.first, count=request.count)
-            return f"{_SERVICE}/GetImages", asked.SerializeToString(), _reads(wire.MapImages)
+            message = "photos of maps are described over HTTP only"
+            raise refuse("server.url", message, expected="http://host:port")
         case GetVersion():
             return f"{_MAPS}/GetVersion", _version_message(request), _reads(wire.MapInfo)
         case UseVersion():

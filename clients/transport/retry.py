@@ -21,7 +21,6 @@ from visloc_api.words.wire import MAP_HEADER
 
 # Before a request is sent a second time. Never a third: it may have ended both servers.
 RESEND_PAUSE_S = 0.1
-_RESENT = ("Localize", "LocalizeRig", "ListMaps", "GetMap", "GetImages")
 # gRPC retries by itself. Its servers answer INTERNAL when a request must not be sent again.
 GRPC_OPTIONS = (
     (
@@ -32,7 +31,7 @@ GRPC_OPTIONS = (
                     {
                         "name": [
                             {"service": "visloc.v1.Localization", "method": method}
-                            for method in _RESENT
+                            for method in ("Localize", "LocalizeRig", "ListMaps", "GetMap")
                         ]
                         + [{"service": "visloc.v1.Maps", "method": "GetVersion"}],
                         "retryPolicy": {

@@ -13,7 +13,6 @@ from visloc.errors import InvalidInput, VislocError
 from visloc_api.words.answers import ImageAnswer, InstantAnswer, LocalizeResponse
 from visloc_api.words.maps import ListMapsResponse, MapInfo
 from visloc_api.words.poses import CoarsePose, PoseEstimate
-from visloc_api.words.scenes import MapImages
 from visloc_api.words.status import Health
 
 _P = ParamSpec("_P")
@@ -114,11 +113,6 @@ def parse_maps(raw: JsonObject) -> list[MapInfo]:
 def parse_map(raw: JsonObject) -> MapInfo:
     """Parse a MapInfo."""
     return MapInfo.model_validate(raw)
-
-
-def parse_images(raw: JsonObject) -> MapImages:
-    """Parse a MapImages."""
-    return MapImages.model_validate(raw)
 
 
 def parse_server(raw: JsonObject) -> ServerInfo:

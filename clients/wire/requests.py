@@ -25,7 +25,6 @@ from visloc.types import MaskedImage, Near, RigSensor
 from visloc_api.words import geometry, rigs, sequences
 from visloc_api.words.options import LocalizeOptions
 from visloc_api.words.photo import LocalizeRequest
-from visloc_api.words.scenes import check_page
 from visloc_api.words.wire import REQUEST_ID
 
 JsonObject = dict[str, Any]
@@ -89,7 +88,7 @@ class GetMap:
 
 @dataclass(frozen=True, slots=True)
 class GetImages:
-    """Tell where photos of a map were taken, and by which cameras; see ``get_images_request``."""
+    """Tell where photos of a map were taken, and by which cameras; see ``get_map_request``."""
 
     map: str
     first: int
@@ -130,17 +129,8 @@ class CheckReady:
     """Tell whether the server can answer now."""
 
 
-Request = (
-    Localize
-    | ListMaps
-    | GetMap
-    | GetImages
-    | GetVersion
-    | UseVersion
-    | DeleteVersion
-    | GetServer
-    | CheckReady
-)
+_OfMap = GetMap | GetImages | GetVersion | UseVersion | DeleteVersion
+Request = Localize | ListMaps | _OfMap | GetServer | CheckReady
 
 
 def checked_search(
@@ -321,17 +311,6 @@ def get_map_request(map_ref: str) -> GetMap:
     """
     _check_map(map_ref)
     return GetMap(map_ref)
-
-
-def get_images_request(map_ref: str, first: int, count: int) -> GetImages:
-    """Check which photos of a map are asked for.
-
-    Raises:
-        InvalidInput: ``map.id``, ``request.invalid``.
-    """
-    _check_map(map_ref)
-    check_page(first, count)
-    return GetImages(map_ref, first, count)
 
 
 def checked_version(map_id: str, version: str) -> tuple[str, str]:

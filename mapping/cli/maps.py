@@ -35,16 +35,7 @@ from mapping.maps.upgrading import lacking, upgrade_map
 from mapping.options import AcceptOption, Gravity, MapArgument, MapsDirOption, WeightsDirOption
 from mapping.progress import one_step
 from mapping.stages.imported_points import read_imported_points
-from visloc.archive import (
-    Anchor,
-    Map,
-    MapStore,
-    SetManifest,
-    open_map,
-    open_set,
-    verify_map,
-    verify_set,
-)
+from visloc.archive import Anchor, Map, SetManifest, open_map, open_set, verify_map, verify_set
 from visloc.archive.checks import read_any_manifest
 from visloc.errors import refuse
 from visloc.features import make_global_descriptor, make_local_features
@@ -183,15 +174,12 @@ def edit(
 
     Poses and landmarks are scaled about the world's (0, 0, 0); directions stay.
     """
-    store = MapStore(maps_dir)
     opened, length = open_map(map_folder(map_ref, maps_dir)), known_length(scale)
     with StageProgress(ERR, if_stopped="nothing was published") as progress:
-        folder = publish_sized(store, opened, length, force=force, accept=accept, progress=progress)
-    sized = open_map(folder)
+        sized = publish_sized(
+            opened, length, maps_dir, force=force, accept=accept, progress=progress
+        )
     print_map(sized)
-    if opened.manifest.pieces:
-        pieces = ", ".join(opened.manifest.pieces)
-        say_notes([f"other pieces of the same build keep units of their own: {pieces}"])
     require_acceptance(sized, accept=accept, pictures=maps_dir / ".work" / ".doubts")
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,6 @@ from mapping.capture.settings import KnownLength, photo_named
 from mapping.capture.trying import doubts_of_capture
 from mapping.frames.anchor import MAX_SCALE_ERROR
 from mapping.maps.editing import content_of, moved
-from mapping.methods.retrieval_only import refuse_without_landmarks
 from mapping.methods.sfm import UNPLACED
 from mapping.own_test.publishing import publish_tested, write_content
 from mapping.own_test.verdict import has_estimated_poses
@@ -28,43 +26,38 @@ from visloc.geometry import Pose, Similarity
 
 
 def publish_sized(
-    store: MapStore,
     opened: Map,
     length: KnownLength,
+    maps_dir: Path,
     *,
     force: bool,
     accept: bool,
     progress: Progress,
-) -> Path:
+) -> Map:
     """Publish a map in metres, as the distance of two of its photos tells them, as a new version.
 
-    Directions and the place of the origin stay. The version takes its own test anew. Where photos
-    placed each other, there is a doubt if the two do not come back where they are.
+    Everything is scaled about the world's (0, 0, 0). Where photos placed each other, there is a
+    doubt if the two do not come back where they are.
 
     Args:
         force: measure a map anew that is in metres already.
-        accept: put it into use whatever speaks against it.
+        accept: put the version into use whatever speaks against it.
 
     Raises:
         InvalidInput: ``capture.photo``; ``edit.scale`` when the length tells no scale, or not the
             one that the map's place on Earth tells.
-        Conflict: ``edit.metric`` without ``force``; ``map.no_landmarks``; ``map.outdated``;
-            ``build.running``.
+        Conflict: ``edit.metric`` without ``force``; ``map.outdated``; ``build.running``.
     """
-    refuse_without_landmarks(opened)
-    manifest = opened.manifest
+    manifest, geodetic = opened.manifest, opened.geodetic
     if manifest.world.metric and not force:
         raise refuse("edit.metric", field="--force", ref=opened.ref)
     names = [image.name for image in opened.images]
     first, second = (photo_named(text, names) for text in length.photos)
-    if first == second:
-        raise refuse("capture.photo", field="--scale", got=f"{first} for both")
     poses = (Pose.from_quaternion(row[:4], row[4:]) for row in opened.image_poses)
     centers = {name: pose.center for name, pose in zip(names, poses, strict=True)}
     scale = scale_of_length(first, second, length.metres, centers)
     if scale.metres is None:
         raise refuse("edit.scale", field="--scale", got=scale.note)
-    geodetic = opened.geodetic
     if geodetic and abs(math.log(geodetic.scale / scale.metres)) > 2 * MAX_SCALE_ERROR:
         raise refuse(
             "edit.scale",
@@ -81,23 +74,17 @@ def publish_sized(
         notes=(*(note for note in content.notes if note != UNPLACED), scale.note),
     )
     # A doubt about the length that told the size before is settled.
-    known = tuple(doubt for doubt in manifest.parts.doubts if doubt.kind != "scale")
+    doubts = [doubt for doubt in manifest.parts.doubts if doubt.kind != "scale"]
+    if has_estimated_poses(opened):
+        doubts += doubts_of_capture(opened, {}, (first, second))
+    store = MapStore(maps_dir)
     with successor_of(opened, store), store.incoming() as incoming:
         link_photos(incoming, photo_files(opened))
         if PAIRS in manifest.files:
             link_or_copy(opened.path / PAIRS, incoming / PAIRS)
         if (imported := read_imported_points(opened)) is not None:
             replace(imported, points=units.apply(imported.points)).write(incoming)
-        version = write_content(
-            incoming,
-            content,
-            manifest.id,
-            examine=partial(doubts_of_capture, films={}, measured=(first, second))
-            if has_estimated_poses(opened)
-            else None,
-            carried=known,
-            progress=progress,
-        )
-        return publish_tested(
-            store, incoming, manifest.id, version, based_on=manifest.version, accept=accept
-        )
+        map_id, based_on = manifest.id, manifest.version
+        version = write_content(incoming, content, map_id, carried=doubts, progress=progress)
+        publish_tested(store, incoming, map_id, version, based_on=based_on, accept=accept)
+    return store.open(f"{map_id}@{version}")

@@ -4,18 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import (
-    AsyncGenerator,
-    AsyncIterator,
-    Awaitable,
-    Callable,
-    Iterator,
-    Mapping,
-    Sequence,
-)
+from collections.abc import AsyncGenerator, AsyncIterator, Iterator, Mapping, Sequence
 from contextlib import aclosing, contextmanager
 from dataclasses import dataclass
-from typing import TypeVar
 
 from service.engine.catalog import Catalog
 from service.engine.instant_tasks import localize_in
@@ -39,14 +30,11 @@ from service.values import (
 from service.workers.judging import gated, judged
 from service.workers.pool import Turn, Workers, using_turn
 from service.workers.tasks import Vision
-from visloc.archive import MapOutline, MapStore, SetOutline
-from visloc.archive.checks import is_set
+from visloc.archive import MapStore
 from visloc.errors import NotFound, VislocError, refuse
 from visloc.types import Near
 
 logger = logging.getLogger(__name__)
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -373,25 +361,3 @@ class Engine:
             raise stopping_error()
         if not self._started:
             raise refuse("server.starting")
-
-
-async def of_version(engine: Engine, ref: str, answer: Callable[[MapOutline], Awaitable[T]]) -> T:
-    """Answer with the version of a map that ``ref`` names.
-
-    Raises:
-        InvalidInput: ``map.is_set``: the landmarks and photos of a set belong to its tiles.
-    """
-    outline = _of_map((await engine.map(ref)).outline)
-    try:
-        return await answer(outline)
-    except NotFound:
-        now = _of_map((await engine.map(ref)).outline)
-        if now.ref == outline.ref:
-            raise
-        return await answer(now)  # a new version became current, and the old one was deleted
-
-
-def _of_map(outline: MapOutline | SetOutline) -> MapOutline:
-    if isinstance(outline, SetOutline):
-        raise is_set(outline.ref, outline.manifest)
-    return outline

@@ -8,9 +8,9 @@ from contextlib import aclosing
 
 from service.api.answers import instant_answer, localize_response
 from service.api.deadlines import TimeLimit, within
-from service.api.maps import map_images, map_info
+from service.api.maps import map_info
 from service.api.request_ids import request_id
-from service.engine.engine import Engine, of_version
+from service.engine.engine import Engine
 from service.grpc.envelope import Context, Envelope, message_of
 from service.grpc.messages import (
     instant_of,
@@ -23,12 +23,10 @@ from service.grpc.reading import converted
 from service.settings import ServiceSettings
 from service.telemetry.observer import Observer
 from service.values import InstantJob, SequenceJob
-from visloc.archive import MapOutline
 from visloc_api.v1 import localization_pb2 as pb2
 from visloc_api.v1 import localization_pb2_grpc as pb2_grpc
 from visloc_api.words.maps import ListMapsResponse
 from visloc_api.words.rigs import BatchLimits
-from visloc_api.words.scenes import IMAGES_PAGE, check_page
 
 
 class LocalizationServicer(pb2_grpc.LocalizationServicer):
@@ -125,22 +123,3 @@ class LocalizationServicer(pb2_grpc.LocalizationServicer):
             # Slow for a set of ten thousand tiles.
             info = await asyncio.to_thread(map_info, served)
             return message_of(info, pb2.MapInfo())
-
-    async def GetImages(  # noqa: N802
-        self, request: pb2.GetImagesRequest, context: Context
-    ) -> pb2.MapImages:
-        """Give the poses and cameras of a map's photos."""
-        async with self._envelope("GetImages", request_id(None), context):
-            count = request.count if request.HasField("count") else IMAGES_PAGE
-            check_page(request.first, count)
-
-            async def answer(outline: MapOutline) -> pb2.MapImages:
-                photos = await self._engine.scenes.photos(outline)
-                return await asyncio.to_thread(
-                    lambda: message_of(
-                        map_images(outline, photos, request.first, count), pb2.MapImages()
-                    )
-                )
-
-            async with within(self._limit):
-                return await of_version(self._engine, request.map, answer)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Awaitable, Callable
 from typing import Annotated, Any
 
 from fastapi import FastAPI, Query, Request, Response
 
 from service.api.deadlines import within
 from service.api.maps import map_images
-from service.engine.engine import of_version
+from service.engine.engine import Engine
 from service.http.backend import backend_of, limit_of
 from service.http.cache_headers import (
     ASK_ALWAYS_PRIVATE,
@@ -18,10 +19,12 @@ from service.http.cache_headers import (
     not_modified,
 )
 from service.http.openapi.app import problems
-from visloc.archive import MapOutline
-from visloc_api.words.scenes import IMAGES_PAGE, MAX_IMAGES, MapImages
+from visloc.archive import MapOutline, SetOutline
+from visloc.archive.checks import is_set
+from visloc.errors import NotFound
+from visloc_api.words.scenes import MapImages
 
-MAX_POINTS = 262_144
+MAX_POINTS, MAX_IMAGES = 262_144, 10_000
 
 _BINARY = "application/octet-stream"
 _CACHED: dict[int | str, dict[str, Any]] = {304: {"description": "as `If-None-Match` names it"}}
@@ -73,14 +76,14 @@ async def get_points(
         return Response(body, headers=headers, media_type=_BINARY)
 
     async with within(limit_of(request)):
-        return await of_version(engine, ref, answer)
+        return await _of_version(engine, ref, answer)
 
 
 async def get_images(
     request: Request,
     ref: str,
     first: First = 0,
-    count: Annotated[int, Query(ge=1, le=MAX_IMAGES, description="most photos")] = IMAGES_PAGE,
+    count: Annotated[int, Query(ge=1, le=MAX_IMAGES, description="most photos")] = 1000,
 ) -> Response:
     """Give the poses of the mapping images of a map (`id`, or `id@version`)."""
     engine = backend_of(request).engine
@@ -96,7 +99,28 @@ async def get_images(
         return Response(text, headers=headers, media_type="application/json")
 
     async with within(limit_of(request)):
-        return await of_version(engine, ref, answer)
+        return await _of_version(engine, ref, answer)
+
+
+async def _of_version(
+    engine: Engine, ref: str, answer: Callable[[MapOutline], Awaitable[Response]]
+) -> Response:
+    """Answer with the version that ``ref`` names."""
+    outline = _of_map((await engine.map(ref)).outline)
+    try:
+        return await answer(outline)
+    except NotFound:
+        now = _of_map((await engine.map(ref)).outline)
+        if now.ref == outline.ref:
+            raise
+        return await answer(now)  # a new version became current, and the old one was deleted
+
+
+def _of_map(outline: MapOutline | SetOutline) -> MapOutline:
+    """Refuse a set: its landmarks and images belong to its tiles (``map.is_set``)."""
+    if isinstance(outline, SetOutline):
+        raise is_set(outline.ref, outline.manifest)
+    return outline
 
 
 def _caching(outline: MapOutline, ref: str, first: int, count: int) -> dict[str, str]:

@@ -37,7 +37,7 @@ _SCOPES_OF_CALLS = {
         f"/{_LOCALIZATION}/{name}": Scope.LOCALIZE
         for name in ("Localize", "LocalizeRig", "LocalizeSequence")
     },
-    **{f"/{_LOCALIZATION}/{name}": Scope.READ for name in ("ListMaps", "GetMap", "GetImages")},
+    **{f"/{_LOCALIZATION}/{name}": Scope.READ for name in ("ListMaps", "GetMap")},
     f"/{_MAPS}/GetVersion": Scope.READ,
     **{f"/{_MAPS}/{name}": Scope.MANAGE for name in ("PutVersion", "DeleteVersion", "SetCurrent")},
 }

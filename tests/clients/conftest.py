@@ -269,6 +269,7 @@ class CannedService:
                 "photo_covariance": [] if is_filled else (np.eye(6) * 2.5e-5).ravel().tolist(),
                 "uncertainty": "whole",
                 "probability": None if is_filled else 0.75,
+                "metric": True,
             },
             "refusal": refusal if rig_from_world is None or is_filled else None,
             "images": answers,

@@ -19,9 +19,12 @@ import grpc
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from rich.console import Console
 
 from clients import AsyncClient, Axes, Client, Near, session_from_map
 from clients.cli.main import main
+from clients.cli.maps_display import print_map
+from service.http.openapi import example
 from tests.conftest import Query
 from visloc.archive import MapStore
 from visloc.archive.checks import (
@@ -34,6 +37,7 @@ from visloc.archive.packed import pack_map
 from visloc.errors import Conflict, InvalidInput, NotFound, TooLarge, VislocError
 from visloc_api.v1 import localization_pb2 as pb2
 from visloc_api.v1.localization_pb2_grpc import MapsStub
+from visloc_api.words.maps import MapInfo
 
 Pack = Callable[..., Path]
 
@@ -218,21 +222,33 @@ def test_a_map_tells_what_an_app_decides_by(
     assert told.num_cameras == len(opened.cameras)
 
 
-def test_the_photos_of_a_map_and_their_cameras_come_in_pages(
-    client: Client, doors: Any, built_maps: Path
-) -> None:
+def test_the_command_shows_what_speaks_against_a_map(capsys: pytest.CaptureFixture[str]) -> None:
+    told = example("map") | {
+        "doubts": [{"kind": "order", "message": "the path of a film jumps"}],
+        "own_test": {"tested": 12, "localized": 11, "wrong": 2},
+        "pieces": ["room-2@v1", "room-3@v1"],
+    }
+
+    print_map(Console(width=200), MapInfo.model_validate(told))
+
+    lines = [line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines()]
+    shown = {line[0]: line[1] for line in lines if len(line) > 1}
+    assert shown["doubt"] == "the path of a film jumps"
+    assert shown["own"] == "test       9 of 12 photos came back where they were, 2 elsewhere"
+    assert shown["pieces"] == "room-2@v1, room-3@v1"
+
+
+def test_the_photos_of_a_map_and_their_cameras_come_in_pages(doors: Any, built_maps: Path) -> None:
     opened = MapStore(built_maps).open("room")
 
-    page = client.images("room", 1, 2)
+    with Client(doors.url) as client:
+        page, whole = client.images("room", 1, 2), client.images("room")
 
     assert (page.first, page.total, page.map.id) == (1, len(opened.images), "room")
     assert [each.name for each in page.images] == [each.name for each in opened.images[1:3]]
     camera = page.images[0].camera
     assert page.cameras[camera].camera == opened.cameras[camera]
-    over_http = doors.http.get("/maps/room/images?first=1&count=2").json()
-    assert page.model_dump(mode="json") == over_http
-    assert len(client.images("room").images) == len(opened.images)
-    assert client.images("room", 10_000).images == []
+    assert [each.name for each in whole.images] == [each.name for each in opened.images]
 
 
 @pytest.mark.parametrize(
@@ -241,28 +257,23 @@ def test_the_photos_of_a_map_and_their_cameras_come_in_pages(
         (("hall",), "map.unknown", "map"),
         (("room@none",), "map.version", "map"),
         (("../room",), "map.id", "map"),
-        (("room", -1), "request.invalid", "first"),
-        (("room", 2**32), "request.invalid", "first"),
-        (("room", 0, 0), "request.invalid", "count"),
-        (("room", 0, 10_001), "request.invalid", "count"),
+        (("room", -1), "request.invalid", "query.first"),
+        (("room", 0, 0), "request.invalid", "query.count"),
+        (("room", 0, 10_001), "request.invalid", "query.count"),
     ],
 )
 def test_photos_that_a_map_cannot_give_are_refused_by_name(
-    client: Client, asked: tuple[Any, ...], code: str, field: str
+    doors: Any, asked: tuple[Any, ...], code: str, field: str
 ) -> None:
-    with pytest.raises(VislocError) as caught:
+    with Client(doors.url) as client, pytest.raises(VislocError) as caught:
         client.images(*asked)
     assert (caught.value.code, caught.value.field) == (code, field)
 
 
-@pytest.mark.parametrize(("field", "value"), [("count", 0), ("count", 10_001)])
-def test_a_page_of_photos_out_of_range_is_refused_over_grpc(
-    doors: Any, field: str, value: int
-) -> None:
-    with pytest.raises(grpc.RpcError) as caught:
-        doors.stub.GetImages(pb2.GetImagesRequest(map="room", **{field: value}))
-    assert caught.value.code() is grpc.StatusCode.INVALID_ARGUMENT
-    assert caught.value.details().startswith(f"{field}: the value is not valid (expected 1 to")
+def test_photos_of_a_map_are_refused_over_grpc_with_the_way_that_has_them(doors: Any) -> None:
+    with Client(f"grpc://127.0.0.1:{doors.server.grpc_port}") as client:
+        error = refused(InvalidInput, "server.url", lambda: client.images("room"))
+    assert error.expected == "http://host:port"
 
 
 def test_an_upload_answers_with_the_place_of_the_version(doors: Any, pack: Pack) -> None:

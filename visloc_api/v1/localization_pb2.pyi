@@ -2327,7 +2327,7 @@ class MapInfo(_message.Message):
 
     @_builtins.property
     def cameras(self) -> _containers.MessageMap[_builtins.str, Global___Camera]:
-        """by id; at most 16: GetImages has all"""
+        """by id; at most 16: GET /maps/{ref}/images has all"""
 
     def __init__(
         self,
@@ -2452,137 +2452,6 @@ class Doubt(_message.Message):
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___Doubt: _TypeAlias = Doubt  # noqa: Y015
-
-@_typing.final
-class GetImagesRequest(_message.Message):
-    DESCRIPTOR: _descriptor.Descriptor
-
-    MAP_FIELD_NUMBER: _builtins.int
-    FIRST_FIELD_NUMBER: _builtins.int
-    COUNT_FIELD_NUMBER: _builtins.int
-    map: _builtins.str
-    """id, or id@version"""
-    first: _builtins.int
-    """place in the map's order to begin at; 0 when left out"""
-    count: _builtins.int
-    """1 to 10 000; 1000 when left out"""
-    def __init__(
-        self,
-        *,
-        map: _builtins.str = ...,
-        first: _builtins.int | None = ...,
-        count: _builtins.int | None = ...,
-    ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_count", b"_count", "_first", b"_first", "count", b"count", "first", b"first"]  # noqa: Y015
-    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_count", b"_count", "_first", b"_first", "count", b"count", "first", b"first", "map", b"map"]  # noqa: Y015
-    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    _WhichOneofReturnType__count: _TypeAlias = _typing.Literal["count"]  # noqa: Y015
-    _WhichOneofArgType__count: _TypeAlias = _typing.Literal["_count", b"_count"]  # noqa: Y015
-    _WhichOneofReturnType__first: _TypeAlias = _typing.Literal["first"]  # noqa: Y015
-    _WhichOneofArgType__first: _TypeAlias = _typing.Literal["_first", b"_first"]  # noqa: Y015
-    @_typing.overload
-    def WhichOneof(self, oneof_group: _WhichOneofArgType__count) -> _WhichOneofReturnType__count | None: ...
-    @_typing.overload
-    def WhichOneof(self, oneof_group: _WhichOneofArgType__first) -> _WhichOneofReturnType__first | None: ...
-
-Global___GetImagesRequest: _TypeAlias = GetImagesRequest  # noqa: Y015
-
-@_typing.final
-class MapImages(_message.Message):
-    """Mapping photos of one version of a map, in the map's order."""
-
-    DESCRIPTOR: _descriptor.Descriptor
-
-    @_typing.final
-    class CamerasEntry(_message.Message):
-        DESCRIPTOR: _descriptor.Descriptor
-
-        KEY_FIELD_NUMBER: _builtins.int
-        VALUE_FIELD_NUMBER: _builtins.int
-        key: _builtins.str
-        @_builtins.property
-        def value(self) -> Global___Camera: ...
-        def __init__(
-            self,
-            *,
-            key: _builtins.str = ...,
-            value: Global___Camera | None = ...,
-        ) -> None: ...
-        _HasFieldArgType: _TypeAlias = _typing.Literal["value", b"value"]  # noqa: Y015
-        def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-        _ClearFieldArgType: _TypeAlias = _typing.Literal["key", b"key", "value", b"value"]  # noqa: Y015
-        def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-        def WhichOneof(self, oneof_group: _Never) -> None: ...
-
-    MAP_FIELD_NUMBER: _builtins.int
-    TOTAL_FIELD_NUMBER: _builtins.int
-    FIRST_FIELD_NUMBER: _builtins.int
-    CAMERAS_FIELD_NUMBER: _builtins.int
-    IMAGES_FIELD_NUMBER: _builtins.int
-    total: _builtins.int
-    """photos that the map has"""
-    first: _builtins.int
-    """as asked for"""
-    @_builtins.property
-    def map(self) -> Global___MapRef: ...
-    @_builtins.property
-    def cameras(self) -> _containers.MessageMap[_builtins.str, Global___Camera]:
-        """of these photos, by id"""
-
-    @_builtins.property
-    def images(self) -> _containers.RepeatedCompositeFieldContainer[Global___MapImage]: ...
-    def __init__(
-        self,
-        *,
-        map: Global___MapRef | None = ...,
-        total: _builtins.int = ...,
-        first: _builtins.int = ...,
-        cameras: _abc.Mapping[_builtins.str, Global___Camera] | None = ...,
-        images: _abc.Iterable[Global___MapImage] | None = ...,
-    ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["map", b"map"]  # noqa: Y015
-    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["cameras", b"cameras", "first", b"first", "images", b"images", "map", b"map", "total", b"total"]  # noqa: Y015
-    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    def WhichOneof(self, oneof_group: _Never) -> None: ...
-
-Global___MapImages: _TypeAlias = MapImages  # noqa: Y015
-
-@_typing.final
-class MapImage(_message.Message):
-    DESCRIPTOR: _descriptor.Descriptor
-
-    NAME_FIELD_NUMBER: _builtins.int
-    CAMERA_FIELD_NUMBER: _builtins.int
-    POSITION_FIELD_NUMBER: _builtins.int
-    ORIENTATION_FIELD_NUMBER: _builtins.int
-    name: _builtins.str
-    camera: _builtins.str
-    """key of MapImages.cameras"""
-    @_builtins.property
-    def position(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
-        """camera centre in the world"""
-
-    @_builtins.property
-    def orientation(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
-        """rotation of world_from_cam as w, x, y, z"""
-
-    def __init__(
-        self,
-        *,
-        name: _builtins.str = ...,
-        camera: _builtins.str = ...,
-        position: _abc.Iterable[_builtins.float] | None = ...,
-        orientation: _abc.Iterable[_builtins.float] | None = ...,
-    ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
-    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["camera", b"camera", "name", b"name", "orientation", b"orientation", "position", b"position"]  # noqa: Y015
-    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    def WhichOneof(self, oneof_group: _Never) -> None: ...
-
-Global___MapImage: _TypeAlias = MapImage  # noqa: Y015
 
 @_typing.final
 class Tile(_message.Message):

@@ -59,11 +59,6 @@ class LocalizationStub:
                 request_serializer=visloc__api_dot_v1_dot_localization__pb2.GetMapRequest.SerializeToString,
                 response_deserializer=visloc__api_dot_v1_dot_localization__pb2.MapInfo.FromString,
                 _registered_method=True)
-        self.GetImages = channel.unary_unary(
-                '/visloc.v1.Localization/GetImages',
-                request_serializer=visloc__api_dot_v1_dot_localization__pb2.GetImagesRequest.SerializeToString,
-                response_deserializer=visloc__api_dot_v1_dot_localization__pb2.MapImages.FromString,
-                _registered_method=True)
 
 
 class LocalizationServicer:
@@ -119,13 +114,6 @@ class LocalizationServicer:
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
-    def GetImages(self, request, context):
-        """Where a map's photos were taken, and by which cameras. A set has none of its own.
-        """
-        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
-        context.set_details('Method not implemented!')
-        raise NotImplementedError('Method not implemented!')
-
 
 def add_LocalizationServicer_to_server(servicer, server):
     rpc_method_handlers = {
@@ -153,11 +141,6 @@ def add_LocalizationServicer_to_server(servicer, server):
                     servicer.GetMap,
                     request_deserializer=visloc__api_dot_v1_dot_localization__pb2.GetMapRequest.FromString,
                     response_serializer=visloc__api_dot_v1_dot_localization__pb2.MapInfo.SerializeToString,
-            ),
-            'GetImages': grpc.unary_unary_rpc_method_handler(
-                    servicer.GetImages,
-                    request_deserializer=visloc__api_dot_v1_dot_localization__pb2.GetImagesRequest.FromString,
-                    response_serializer=visloc__api_dot_v1_dot_localization__pb2.MapImages.SerializeToString,
             ),
     }
     generic_handler = grpc.method_handlers_generic_handler(
@@ -295,33 +278,6 @@ class Localization:
             '/visloc.v1.Localization/GetMap',
             visloc__api_dot_v1_dot_localization__pb2.GetMapRequest.SerializeToString,
             visloc__api_dot_v1_dot_localization__pb2.MapInfo.FromString,
-            options,
-            channel_credentials,
-            insecure,
-            call_credentials,
-            compression,
-            wait_for_ready,
-            timeout,
-            metadata,
-            _registered_method=True)
-
-    @staticmethod
-    def GetImages(request,
-            target,
-            options=(),
-            channel_credentials=None,
-            call_credentials=None,
-            insecure=False,
-            compression=None,
-            wait_for_ready=None,
-            timeout=None,
-            metadata=None):
-        return grpc.experimental.unary_unary(
-            request,
-            target,
-            '/visloc.v1.Localization/GetImages',
-            visloc__api_dot_v1_dot_localization__pb2.GetImagesRequest.SerializeToString,
-            visloc__api_dot_v1_dot_localization__pb2.MapImages.FromString,
             options,
             channel_credentials,
             insecure,

@@ -61,8 +61,6 @@ class LocalizationStub:
     """
     ListMaps: _grpc.UnaryUnaryMultiCallable[_localization_pb2.ListMapsRequest, _localization_pb2.ListMapsResponse]
     GetMap: _grpc.UnaryUnaryMultiCallable[_localization_pb2.GetMapRequest, _localization_pb2.MapInfo]
-    GetImages: _grpc.UnaryUnaryMultiCallable[_localization_pb2.GetImagesRequest, _localization_pb2.MapImages]
-    """Where a map's photos were taken, and by which cameras. A set has none of its own."""
 
 @_typing.type_check_only
 class LocalizationAsyncStub(LocalizationStub):
@@ -95,8 +93,6 @@ class LocalizationAsyncStub(LocalizationStub):
     """
     ListMaps: _aio.UnaryUnaryMultiCallable[_localization_pb2.ListMapsRequest, _localization_pb2.ListMapsResponse]  # type: ignore[assignment]
     GetMap: _aio.UnaryUnaryMultiCallable[_localization_pb2.GetMapRequest, _localization_pb2.MapInfo]  # type: ignore[assignment]
-    GetImages: _aio.UnaryUnaryMultiCallable[_localization_pb2.GetImagesRequest, _localization_pb2.MapImages]  # type: ignore[assignment]
-    """Where a map's photos were taken, and by which cameras. A set has none of its own."""
 
 class LocalizationServicer(metaclass=_abc_1.ABCMeta):
     @_abc_1.abstractmethod
@@ -156,14 +152,6 @@ class LocalizationServicer(metaclass=_abc_1.ABCMeta):
         request: _localization_pb2.GetMapRequest,
         context: _ServicerContext,
     ) -> _typing.Union[_localization_pb2.MapInfo, _abc.Awaitable[_localization_pb2.MapInfo]]: ...
-
-    @_abc_1.abstractmethod
-    def GetImages(
-        self,
-        request: _localization_pb2.GetImagesRequest,
-        context: _ServicerContext,
-    ) -> _typing.Union[_localization_pb2.MapImages, _abc.Awaitable[_localization_pb2.MapImages]]:
-        """Where a map's photos were taken, and by which cameras. A set has none of its own."""
 
 def add_LocalizationServicer_to_server(servicer: LocalizationServicer, server: _typing.Union[_grpc.Server, _aio.Server]) -> None: ...
 

@@ -6,13 +6,9 @@ from typing import Annotated
 
 from pydantic import Field
 
-from visloc.errors import refuse
 from visloc.geometry import Camera
 from visloc_api.words.answers import MapRef
 from visloc_api.words.base import Answer
-
-# Most photos in one answer, and how many there are unless the request says otherwise.
-MAX_IMAGES, IMAGES_PAGE = 10_000, 1000
 
 
 class MapCamera(Answer):
@@ -48,13 +44,3 @@ class MapImages(Answer):
     first: Annotated[int, Field(description="as asked for; 0 is the first")]
     cameras: Annotated[dict[str, MapCamera], Field(description="cameras of these photos, by id")]
     images: list[MapImage]
-
-
-def check_page(first: int, count: int) -> None:
-    """Refuse a part of the photos that cannot be asked for (``request.invalid``)."""
-    for name, value, least, most in (
-        ("first", first, 0, 2**32 - 1),
-        ("count", count, 1, MAX_IMAGES),
-    ):
-        if not least <= value <= most:
-            raise refuse("request.invalid", field=name, expected=f"{least} to {most}", got=value)

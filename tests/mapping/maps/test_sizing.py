@@ -110,7 +110,7 @@ def test_a_map_is_in_metres_once_a_length_is_known(unsized: Map, maps: Path) -> 
     ("scale", "code", "got"),
     [
         (("nowhere.jpg", "{b}", "3m"), "capture.photo", "nowhere.jpg: 0 photos"),
-        (("{a}", "{a}", "3m"), "capture.photo", "for both"),
+        (("{a}", "{a}", "3m"), "edit.scale", "taken at one place"),
         (("{a}", "{b}", "0m"), "capture.length", "0m"),
         (("{a}", "{b}", "-3m"), "capture.length", "-3m"),
         (("{a}", "{b}", "nan"), "capture.length", "nan"),

@@ -463,7 +463,6 @@ def test_all_messages_of_the_proto_have_a_model() -> None:
     without = {
         "ListMapsRequest",
         "GetMapRequest",
-        "GetImagesRequest",
         "VersionRef",
         "PutVersionRequest",
         "DeleteVersionResponse",

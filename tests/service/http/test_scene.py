@@ -19,8 +19,8 @@ import pytest
 from starlette.responses import Response
 
 import service.engine.scenes
-from service.engine.engine import of_version
 from service.engine.scenes import Scenes, _Kept
+from service.http.scenes import _of_version
 from service.security.key_file import Scope, edited_keys, new_key
 from service.values import MapFolder, ServedMap
 from tests.service.conftest import Doors
@@ -384,10 +384,10 @@ def test_a_version_that_goes_meanwhile_is_looked_up_once_more(
 
     engine: Any = Replaced()
     if takes_over:
-        assert asyncio.run(of_version(engine, "room", answer)).body == b"second"
+        assert asyncio.run(_of_version(engine, "room", answer)).body == b"second"
     else:
         with pytest.raises(NotFound):
-            asyncio.run(of_version(engine, "room", answer))
+            asyncio.run(_of_version(engine, "room", answer))
     assert versions == []
 
 

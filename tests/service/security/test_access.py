@@ -146,7 +146,7 @@ def test_every_method_of_grpc_needs_a_scope_of_its_own() -> None:
 
     assert needed == {
         **dict.fromkeys(("Localize", "LocalizeRig", "LocalizeSequence"), LOCALIZE),
-        **dict.fromkeys(("ListMaps", "GetMap", "GetImages", "GetVersion"), READ),
+        **dict.fromkeys(("ListMaps", "GetMap", "GetVersion"), READ),
         **dict.fromkeys(("PutVersion", "DeleteVersion", "SetCurrent"), MANAGE),
     }
     assert needed_over_grpc("/grpc.health.v1.Health/Check") is NOTHING
