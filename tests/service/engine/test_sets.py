@@ -324,6 +324,7 @@ def test_a_sequence_goes_from_tile_to_tile_in_legs(
     tiles = [(each.tile or "").partition("@")[0] for each in found]
     assert tiles == ["room", "room", "study", "study", "study", "room"]
     assert [each.status for each in found[:3]] == ["localized"] * 3
+    assert [each.pose.metric for each in found[:3]] == [True] * 3
     assert found[3].status == "filled"  # by the two photos of the same leg around it
     for each, (image, moved) in zip(
         found[:2], [(q, SITE_FROM_ROOM) for q in queries[:2]], strict=True
