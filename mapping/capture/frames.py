@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mapping.capture.choosing import ChosenFrames, choose_frames
 from mapping.capture.motion import Motion, measure_motion
-from mapping.capture.video import Frame, VideoFacts, frames_of, video_facts
+from mapping.films.video import Frame, VideoFacts, frames_of, video_facts
 from mapping.progress import ItemProgress
 from mapping.stages.work_folder import WorkFolder, key_of
 from visloc.archive import sha256_of

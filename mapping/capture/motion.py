@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.capture.video import Frame
+from mapping.films.video import Frame
 
 # Motion blur of a pixel or two is visible at this size, and corners are tracked at a third of it.
 _SHARPNESS_SIDE, _TRACKING_SIDE = 960, 320

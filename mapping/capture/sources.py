@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from mapping.capture.frames import FilmedVideo, study_video, write_photos
-from mapping.capture.video import SUFFIXES, is_video
+from mapping.films.video import SUFFIXES, is_video
 from mapping.importers import ImportedImage, ImportedModel, read_model
 from mapping.importers.reading.photo_names import photo_size
 from mapping.methods.sparse.intrinsics import FROM_EXIF

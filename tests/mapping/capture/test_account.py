@@ -17,7 +17,7 @@ from mapping.capture.job import Captured
 from mapping.capture.motion import Motion
 from mapping.capture.picture import draw_walk
 from mapping.capture.trying import Trials, try_photos
-from mapping.capture.video import VideoFacts
+from mapping.films.video import VideoFacts
 from mapping.methods.sparse.intrinsics import CAMERAS, CameraOrigin, Reason
 from visloc.archive.schema import Doubt
 

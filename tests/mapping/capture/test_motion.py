@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mapping.capture.motion import measure_motion
-from mapping.capture.video import frames_of
+from mapping.films.video import frames_of
 from tests.mapping.capture.conftest import panned, texture
 
 

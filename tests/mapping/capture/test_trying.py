@@ -13,7 +13,7 @@ from mapping.capture.choosing import ChosenFrames
 from mapping.capture.frames import FilmedVideo
 from mapping.capture.motion import Motion
 from mapping.capture.trying import doubts_of_capture, out_of_order, try_photos
-from mapping.capture.video import VideoFacts
+from mapping.films.video import VideoFacts
 from visloc.geometry import Camera, Pose
 from visloc.pose.colmap import project
 

@@ -2,13 +2,15 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
+from fractions import Fraction
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 
-from mapping.capture import video
-from mapping.capture.video import frames_of, is_video, video_facts
+from mapping.films import video
+from mapping.films.video import frames_of, is_video, video_facts
 from tests.mapping.capture.conftest import Picture, panned
 from visloc.errors import InvalidInput, TooLarge
 
@@ -123,6 +125,70 @@ def test_places_that_are_none(make_video: MakeVideo, place: str) -> None:
     assert video_facts(make_video(panned(2, step=4), "a.mov", tags=tags)).position is None
 
 
+@pytest.mark.parametrize(
+    ("first", "count", "suffix"),
+    [
+        ((384, 288), 1, "mp4"),  # a cover picture
+        ((1280, 960), 1, "mp4"),  # one that is larger than the film
+        ((1280, 960), 1, "mkv"),
+        ((96, 72), 12, "mov"),  # a small copy of the film
+    ],
+)
+def test_the_film_is_read_whatever_track_comes_first(
+    tmp_path: Path, first: tuple[int, int], count: int, suffix: str
+) -> None:
+    path = tmp_path / f"walk.{suffix}"
+    with av.open(str(path), "w") as container:
+        tracks = []
+        for (width, height), codec in ((first, "mjpeg"), ((320, 240), "libx264")):
+            stream = container.add_stream(codec, rate=10)
+            assert isinstance(stream, av.VideoStream)
+            stream.width, stream.height = width, height
+            stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+            tracks.append(stream)
+        for stream, pictures in zip(
+            tracks, (panned(count, 1, first), panned(12, step=8)), strict=True
+        ):
+            for picture in pictures:
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+            container.mux(stream.encode())
+    frames = list(frames_of(path))
+    assert [frame.rgb().shape for frame in frames] == [(240, 320, 3)] * 12
+    facts = video_facts(path)
+    assert (facts.width, facts.height) == (320, 240)
+
+
+@pytest.mark.parametrize(
+    ("aspect", "size"),
+    [
+        (Fraction(4, 3), (427, 240)),
+        (Fraction(3, 4), (320, 320)),
+        (Fraction(1), (320, 240)),
+        (Fraction(2000, 2001), (320, 240)),  # less than a pixel
+    ],
+)
+def test_pixels_become_square(
+    make_video: MakeVideo, aspect: Fraction, size: tuple[int, int]
+) -> None:
+    path = make_video([corner_marked()] * 3, sample_aspect_ratio=aspect)
+    facts = video_facts(path)
+    assert (facts.width, facts.height) == size
+    frame = next(frames_of(path))
+    assert frame.rgb().shape == (size[1], size[0], 3)
+    assert frame.grey(10_000).shape == size[::-1]
+    red = frame.rgb()[..., 0].astype(int) - frame.rgb()[..., 2] > 100
+    assert red.mean() == pytest.approx(0.25, abs=0.01)  # still a quarter, at the top left
+    assert red_corner(frame.rgb()) == (False, False)
+    turned(path, _CLOCKWISE)  # first squared, then turned
+    assert next(frames_of(path)).upright_rgb().shape == (*size, 3)
+
+
+def test_pixels_of_no_camera_are_refused(make_video: MakeVideo) -> None:
+    path = make_video([corner_marked()] * 3, sample_aspect_ratio=Fraction(9))
+    with pytest.raises(InvalidInput, match="pixels that are 9 as wide as high"):
+        video_facts(path)
+
+
 # Hostile files
 
 
@@ -181,8 +247,6 @@ def test_damage_within_is_passed_over_or_refused(make_video: MakeVideo) -> None:
 
 
 def test_sound_alone_is_refused(tmp_path: Path) -> None:
-    import av
-
     path = tmp_path / "sound.mp4"
     with av.open(str(path), "w") as container:
         stream = container.add_stream("aac", rate=44100, layout="mono")

@@ -13,16 +13,18 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 
 import av
+import cv2
 import numpy as np
 from av.container import InputContainer
 from av.error import FFmpegError
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
-from mapping.capture.tone import is_high_range, to_standard_range
+from mapping.films.tone import is_high_range, to_standard_range
 from visloc.errors import VislocError, refuse
 from visloc.file_kinds import HEAD_BYTES, file_kind
 from visloc.images import ImageLimits
@@ -37,6 +39,9 @@ _MIN_SIDE = 64
 _MAX_FRAMES, _MAX_SECONDS = 250_000, 4 * 3600.0
 # A box of an MP4 has at least its size and kind. Films that are whole have about five.
 _BOX_BYTES, _MOST_BOXES = 8, 1000
+# Width by height of a pixel: DV, DVD and anamorphic lenses have 0.7 to 2. Less than the least is no
+# whole pixel in a row.
+_WIDEST_PIXEL, _LEAST_STRETCH = 4.0, 0.0005
 # Damaged packets are passed over up to this number in a row.
 _MAX_DAMAGED = 300
 _ISO6709 = re.compile(r"([+-]\d{2}(?:\.\d+)?)([+-]\d{3}(?:\.\d+)?)([+-]\d+(?:\.\d+)?)?")
@@ -62,8 +67,8 @@ class VideoFacts:
     """What a container tells of its video before a frame is decoded.
 
     Attributes:
-        width: of the stored pixels, before they are turned upright.
-        height: of the stored pixels.
+        width: in square pixels, before they are turned upright.
+        height: in square pixels.
         seconds: as the container says; 0 when it does not.
         device: make and model; may be empty.
         focal_length_px: None when the container does not tell it, as most do not.
@@ -85,10 +90,12 @@ class Frame:
     Attributes:
         seconds: its presentation time, counted from the video's first frame.
         decoded: the pixels as stored.
+        size: width and height of the same picture in square pixels.
     """
 
     seconds: float
     decoded: av.VideoFrame
+    size: tuple[int, int]
 
     @property
     def quarter_turns(self) -> int:
@@ -99,20 +106,26 @@ class Frame:
         return round(self.decoded.rotation / 90.0) % 4
 
     def grey(self, longer_side: int) -> NDArray[np.uint8]:
-        """(h, w) as stored, scaled so that its longer side is at most so long."""
-        width, height = self.decoded.width, self.decoded.height
+        """(h, w), not turned, scaled so that its longer side is at most ``longer_side``."""
+        width, height = self.size
         scale = min(1.0, longer_side / max(width, height))
         size = max(1, round(width * scale)), max(1, round(height * scale))
         small = self.decoded.reformat(*size, format="gray8", interpolation="AREA")
         return np.asarray(small.to_ndarray(), dtype=np.uint8)
 
-    def upright_rgb(self) -> NDArray[np.uint8]:
-        """(H, W, 3) upright; HDR as a standard picture."""
+    def rgb(self) -> NDArray[np.uint8]:
+        """(H, W, 3) in square pixels, not turned; HDR as a standard picture."""
         if is_high_range(self.decoded):
             rgb = to_standard_range(self.decoded)
         else:
             rgb = np.asarray(self.decoded.to_ndarray(format="rgb24"), dtype=np.uint8)
-        return np.ascontiguousarray(np.rot90(rgb, self.quarter_turns))
+        if rgb.shape[1::-1] != self.size:
+            rgb = np.asarray(cv2.resize(rgb, self.size, interpolation=cv2.INTER_CUBIC), np.uint8)
+        return rgb
+
+    def upright_rgb(self) -> NDArray[np.uint8]:
+        """(H, W, 3) as ``rgb``, upright."""
+        return np.ascontiguousarray(np.rot90(self.rgb(), self.quarter_turns))
 
 
 def is_video(path: Path) -> bool:
@@ -133,7 +146,7 @@ def video_facts(path: Path) -> VideoFacts:
     """
     with _opened(path) as (container, stream):
         tags = {**container.metadata, **stream.metadata}
-        width, height = stream.codec_context.width, stream.codec_context.height
+        width, height = _square_size(path, stream)
         return VideoFacts(
             width=width,
             height=height,
@@ -157,6 +170,7 @@ def frames_of(path: Path) -> Iterator[Frame]:
     first, last, count, damaged = None, -math.inf, 0, 0
     with _opened(path) as (container, stream):
         size = stream.codec_context.width, stream.codec_context.height
+        square = _square_size(path, stream)
         for packet in container.demux(stream):
             try:
                 decoded = packet.decode()
@@ -175,7 +189,7 @@ def frames_of(path: Path) -> Iterator[Frame]:
                 last = time
                 if count > _MAX_FRAMES or time - first > _MAX_SECONDS:
                     raise refuse("capture.video_length", field=str(path), got="more")
-                yield Frame(time - first, frame)
+                yield Frame(time - first, frame, square)
 
 
 @contextmanager
@@ -197,13 +211,28 @@ def _opened(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
         with container:
             if not container.streams.video:
                 raise refuse("capture.video", field=str(path), got="no video track")
-            stream = container.streams.video[0]
+            stream = _film_track(container)
             _check_size(path, stream)
             stream.thread_type = "AUTO"
             try:
                 yield container, stream
             except FFmpegError as error:
                 raise _unreadable(path, error) from error
+
+
+def _film_track(container: InputContainer) -> VideoStream:
+    """Choose the track of the film: others may be its cover picture or a smaller copy.
+
+    Of the tracks with about as many frames as any, it is the one of most pixels. Where the
+    container does not count frames, as Matroska, FFmpeg chooses.
+    """
+    tracks = container.streams.video
+    most = max(track.frames for track in tracks)
+    best = container.streams.best("video")
+    if most == 0 and isinstance(best, VideoStream):
+        return best
+    full = [track for track in tracks if 2 * track.frames >= most]
+    return max(full, key=lambda track: track.codec_context.width * track.codec_context.height)
 
 
 def _is_cut(path: Path) -> bool:
@@ -226,12 +255,25 @@ def _is_cut(path: Path) -> bool:
     return False
 
 
+def _square_size(path: Path, stream: VideoStream) -> tuple[int, int]:
+    """Return width and height after pixels became square: none is lost, the short side grows."""
+    width, height = stream.codec_context.width, stream.codec_context.height
+    aspect = float(stream.sample_aspect_ratio or 1)
+    if not 1 / _WIDEST_PIXEL <= aspect <= _WIDEST_PIXEL:
+        got = f"pixels that are {Fraction(aspect).limit_denominator(1000)} as wide as high"
+        raise refuse("capture.video", field=str(path), got=got)
+    if abs(aspect - 1) < _LEAST_STRETCH:
+        return width, height
+    return (round(width * aspect), height) if aspect > 1 else (width, round(height / aspect))
+
+
 def _check_size(path: Path, stream: VideoStream) -> None:
     context = stream.codec_context
     if min(context.width, context.height) < _MIN_SIDE:
         raise refuse("capture.video", field=str(path), got=f"{context.width} x {context.height}")
-    if context.width * context.height > _MAX_PIXELS:
-        raise refuse("capture.video_size", field=str(path), got=f"{context.width}x{context.height}")
+    width, height = _square_size(path, stream)
+    if width * height > _MAX_PIXELS:
+        raise refuse("capture.video_size", field=str(path), got=f"{width}x{height}")
     # A frame may claim another size than its track; the decoder then refuses it.
     context.options = {"max_pixels": _PIXELS_OPTION}
 
