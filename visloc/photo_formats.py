@@ -57,6 +57,7 @@ _READERS: Mapping[str, Callable[[io.BytesIO], ImageFile]] = {
     "AVIF": AvifImageFile,
 }
 _JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
+PNG_GREY = 0  # a colour type of PNG
 # What Pillow's parsers raise on malformed files. It is not documented; this is what fuzzing and
 # reading them showed.
 MALFORMED = (
@@ -154,6 +155,12 @@ def open_header(data: bytes, field: str, max_webp_pixels: float = math.inf) -> P
             got=str(error) or type(error).__name__,
         ) from error
     return _pillow_header(kind.name, opened, data)
+
+
+def png_samples(data: bytes) -> tuple[int, int] | None:
+    """Return the bits per sample and the colour type of a PNG; None for other files."""
+    is_one = data.startswith(_PNG) and data[12:16] == b"IHDR" and len(data) > 25
+    return (data[24], data[25]) if is_one else None
 
 
 def mask_hides_unsaid(data: bytes) -> str | None:

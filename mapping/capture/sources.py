@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence, Set
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
 from mapping.capture.frames import FilmedVideo, study_video, write_photos
-from mapping.films.video import SUFFIXES, is_video
+from mapping.films.video import SUFFIXES, is_live_photo, is_video, stems_of_photos
 from mapping.importers import ImportedImage, ImportedModel, read_model
-from mapping.importers.reading.photo_names import photo_size
+from mapping.importers.left_out import LeftOut, notes_on
+from mapping.importers.reading.photo_names import natural_order, photo_size
 from mapping.methods.sparse.intrinsics import FROM_EXIF
 from mapping.progress import Progress
 from mapping.stages.work_folder import WorkFolder
-from visloc.errors import DatasetError, refuse
+from visloc.errors import DatasetError, VislocError, refuse
 from visloc.geometry import Camera
 from visloc.kapture import GnssRecord, Sensor
 from visloc.kapture.dataset import UNKNOWN_CAMERA
@@ -25,6 +26,8 @@ _EXPORT = "transforms.json"
 _GNSS = "gnss"
 # A video whose frames end so long before the end that it states may have been cut.
 _CUT_S = 1.0
+# Why a video that was found in a folder is left out, and one that was named is refused.
+_UNUSABLE = ("capture.still", "capture.video", "capture.video_size", "capture.video_length")
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,17 +38,22 @@ class Sources:
         videos: files.
         folders: of photos.
         exports: folders or files of nerfstudio's format.
+        found: names of the videos that were found in folders.
+        left_out: videos of folders that cannot be used, by reason.
     """
 
     videos: Mapping[str, Path]
     folders: Mapping[str, Path]
     exports: Mapping[str, Path]
+    found: Set[str] = frozenset()
+    left_out: LeftOut = field(default_factory=dict)
 
 
 def find_sources(paths: Sequence[Path]) -> Sources:
     """Tell videos, folders of photos, and exports apart; videos in folders count too.
 
-    What is named twice counts once, such as a video and the folder that it lies in.
+    What is named twice counts once, such as a video and the folder that it lies in. Films of Live
+    Photos do not count: the photos beside them do.
 
     Raises:
         NotFound: ``capture.source`` for what is not there.
@@ -54,6 +62,7 @@ def find_sources(paths: Sequence[Path]) -> Sources:
     videos: dict[str, Path] = {}
     folders: dict[str, Path] = {}
     exports: dict[str, Path] = {}
+    found: set[str] = set()
     taken: set[str] = set()
     counted: set[str] = set()
     for path in paths:
@@ -69,18 +78,24 @@ def find_sources(paths: Sequence[Path]) -> Sources:
             exports[_new_name(path.resolve().name, taken)] = path
         elif path.is_dir():
             folders[_new_name(path.resolve().name, taken)] = path
-            for file in sorted(path.iterdir()):
+            files = sorted(path.iterdir(), key=lambda file: natural_order(file.name))
+            stems = stems_of_photos(file.name for file in files)
+            for file in files:
                 is_one = file.suffix.lower() in SUFFIXES and _is_plain(file) and is_video(file)
-                if is_one and (place := os.path.realpath(file)) not in counted:
+                if not is_one or is_live_photo(file, stems):
+                    continue
+                if (place := os.path.realpath(file)) not in counted:
                     counted.add(place)
-                    videos[_new_name(file.stem, taken)] = file
+                    name = _new_name(file.stem, taken)
+                    videos[name] = file
+                    found.add(name)
         elif path.suffix.lower() == ".json" and path.is_file():  # a pipe would never end
             exports[_new_name(path.resolve().parent.name, taken)] = path
         elif path.is_file() and is_video(path):
             videos[_new_name(path.stem, taken)] = path
         else:
             raise refuse("capture.video", field=str(path), got="another kind of file")
-    return Sources(videos, folders, exports)
+    return Sources(videos, folders, exports, found)
 
 
 def study_videos(
@@ -89,22 +104,32 @@ def study_videos(
     most: int,
     wanted: Mapping[str, Sequence[float]],
     progress: Progress,
-) -> dict[str, FilmedVideo]:
+) -> tuple[Sources, dict[str, FilmedVideo]]:
     """Look through all videos, and choose frames.
 
     Args:
         most: frames of each video.
         wanted: seconds by name of the video whose frames are taken in any case.
 
+    Returns:
+        The sources without the videos of folders that cannot be used, and the others by name.
+
     Raises:
-        InvalidInput, TooLarge: as ``study_video``.
+        InvalidInput, TooLarge: as ``study_video``, for a video that was named.
     """
-    return {
-        name: study_video(
-            path, work, most, wanted.get(name, ()), partial(progress, f"look through {name}")
-        )
-        for name, path in sources.videos.items()
-    }
+    studied: dict[str, FilmedVideo] = {}
+    left_out: dict[str, list[str]] = {}
+    for name, path in sources.videos.items():
+        told = partial(progress, f"look through {name}")
+        try:
+            studied[name] = study_video(path, work, most, wanted.get(name, ()), told)
+        except VislocError as error:
+            if name not in sources.found or error.code not in _UNUSABLE:
+                raise
+            reason = error.message + (f": {error.got}" if error.code != "capture.still" else "")
+            left_out.setdefault(reason, []).append(f"{path.parent.resolve().name}/{path.name}")
+    videos = {name: sources.videos[name] for name in studied}
+    return replace(sources, videos=videos, left_out=left_out), studied
 
 
 def read_capture(
@@ -128,28 +153,39 @@ def read_capture(
         write_photos(video, folder, partial(progress, f"frames of {name}"))
         parts[name] = _video_model(video, folder)
     for name, path in sources.folders.items():
-        if (model := _read_folder(path, progress, has_videos=bool(videos))) is not None:
+        if (model := _read_folder(path, progress, sources)) is not None:
             parts[name] = model
     for name, path in sources.exports.items():
         parts[name] = read_model("nerfstudio", path, None, progress)
+    if not parts:
+        raise refuse(
+            "import.empty",
+            "; ".join(["there are neither photos nor videos to use", *notes_on(sources.left_out)]),
+            field=", ".join(map(str, sources.folders.values())),
+            expected="photos, or videos filmed while walking",
+        )
     for name, model in parts.items():
         assert model.photos is not None
         (photos / name).symlink_to(model.photos.resolve())
-    return _joined(parts, photos)
+    return _joined(parts, photos, sources.left_out)
 
 
-def _read_folder(path: Path, progress: Progress, *, has_videos: bool) -> ImportedModel | None:
+def _read_folder(path: Path, progress: Progress, sources: Sources) -> ImportedModel | None:
     try:
         model = read_model("images", path, None, progress)
     except DatasetError as error:
-        if error.code == "import.empty" and has_videos:
+        if error.code == "import.empty" and (sources.videos or sources.left_out):
             return None  # a folder of videos
         raise
-    left_out = {}
-    for reason, names in model.left_out.items():
-        others = [n for n in names if "/" in n or not n.lower().endswith(SUFFIXES)]
-        if others:
-            left_out[reason] = others
+    # What became of its videos is told elsewhere.
+    folder = path.resolve()
+    looked_at = {str(video.resolve()) for video in sources.videos.values()}
+    looked_at |= {str(folder.parent / one) for names in sources.left_out.values() for one in names}
+    left_out = {
+        reason: others
+        for reason, names in model.left_out.items()
+        if (others := [name for name in names if str(folder / name) not in looked_at])
+    }
     return replace(model, left_out=left_out)
 
 
@@ -186,12 +222,14 @@ def _notes_on(video: FilmedVideo) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def _joined(parts: Mapping[str, ImportedModel], photos: Path) -> ImportedModel:
+def _joined(
+    parts: Mapping[str, ImportedModel], photos: Path, videos_left_out: LeftOut
+) -> ImportedModel:
     """Join models: names below the part's, sensors with its name, timestamps one after another."""
     sensors: dict[str, Sensor] = {}
     images: list[ImportedImage] = []
     gnss: list[GnssRecord] = []
-    left_out: dict[str, list[str]] = {}
+    left_out = {reason: list(names) for reason, names in videos_left_out.items()}
     notes: list[str] = []
     start, posed = 0, ""
     for name, model in parts.items():

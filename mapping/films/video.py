@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Set
 from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
@@ -28,6 +28,7 @@ from mapping.films.tone import is_high_range, to_standard_range
 from visloc.errors import VislocError, refuse
 from visloc.file_kinds import HEAD_BYTES, file_kind
 from visloc.images import ImageLimits
+from visloc.photo_formats import SUFFIXES as PHOTO_SUFFIXES
 
 SUFFIXES = (".mp4", ".m4v", ".mov", ".webm", ".mkv", ".3gp", ".3g2")
 # Demuxers by kind of file (visloc.file_kinds).
@@ -42,6 +43,8 @@ _BOX_BYTES, _MOST_BOXES = 8, 1000
 # Width by height of a pixel: DV, DVD and anamorphic lenses have 0.7 to 2. Less than the least is no
 # whole pixel in a row.
 _WIDEST_PIXEL, _LEAST_STRETCH = 4.0, 0.0005
+# A phone films about three seconds around a photo; edited ones may be longer.
+_LONGEST_LIVE_S = 5.0
 # Damaged packets are passed over up to this number in a row.
 _MAX_DAMAGED = 300
 _ISO6709 = re.compile(r"([+-]\d{2}(?:\.\d+)?)([+-]\d{3}(?:\.\d+)?)([+-]\d+(?:\.\d+)?)?")
@@ -136,6 +139,27 @@ def is_video(path: Path) -> bool:
     except OSError:
         return False
     return kind is not None and kind.name in _DEMUXERS
+
+
+def stems_of_photos(names: Iterable[str]) -> frozenset[str]:
+    """Return the stems of the photos among names of files, for ``is_live_photo``."""
+    paths = (Path(name.lower()) for name in names)
+    return frozenset(path.stem for path in paths if path.suffix in PHOTO_SUFFIXES)
+
+
+def is_live_photo(path: Path, stems: Set[str]) -> bool:
+    """Tell the film that a phone takes around a photo, by its length and the photo's name.
+
+    Args:
+        stems: of the photos in the same folder, as ``stems_of_photos``.
+    """
+    stem, name = path.stem.lower(), path.name.lower()
+    if not stems & {stem, stem.removesuffix("_hevc"), name} or not is_video(path):
+        return False
+    try:
+        return video_facts(path).seconds <= _LONGEST_LIVE_S
+    except VislocError:
+        return False
 
 
 def video_facts(path: Path) -> VideoFacts:

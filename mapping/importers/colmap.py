@@ -1,7 +1,8 @@
 """COLMAP's models (text or binary, with or without rigs) and databases, read through pycolmap.
 
 COLMAP's conventions of poses, cameras and pixels are ours. Photos have no timestamps: the rank of
-the name takes their place, and photos of one rig frame share the rank of the first.
+the name takes their place, and photos of one rig frame share the rank of the first. On Windows,
+names have backslashes.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from mapping.importers.colmap_checks import check_model, has_model
 from mapping.importers.colmap_database import REFUSALS, Database, DatabaseImage, read_database
 from mapping.importers.largest import ModelSize, largest_model
 from mapping.importers.model import ImportedImage, ImportedModel
-from mapping.importers.reading.photo_names import photo_names
+from mapping.importers.reading.photo_names import natural_order, photo_names
 from visloc.errors import DatasetError, InvalidInput, NotFound, VislocError, refuse
 from visloc.geometry import CAMERA_MODELS, Camera, Pose
 from visloc.kapture import GnssRecord, Sensor
@@ -137,7 +138,7 @@ def _model(
     photos: Path | None,
     notes: list[str],
 ) -> ImportedModel:
-    colmap_images = sorted(model.images.values(), key=lambda image: image.name)
+    colmap_images = sorted(model.images.values(), key=lambda image: natural_order(image.name))
     rows = {image.image_id: row for row, image in enumerate(colmap_images)}
     keypoints = [_points2d(image) for image in colmap_images]
     names = [image.name for image in colmap_images]
@@ -184,7 +185,7 @@ def _model(
 
 
 def _model_of_database(database: Database, photos: Path | None) -> ImportedModel:
-    names = sorted(database.images)
+    names = sorted(database.images, key=natural_order)
     timestamps = _timestamps([(name, database.images[name].frame) for name in names])
     users = {database.images[name].camera: name for name in names}
     notes = [*database.notes, "a database has no poses: mapping build --poses estimate finds them"]

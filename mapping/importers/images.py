@@ -8,22 +8,26 @@ from __future__ import annotations
 import math
 import os
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
 from PIL import ExifTags
 
+from mapping.films.video import is_live_photo, stems_of_photos
 from mapping.importers.left_out import notes_on
 from mapping.importers.model import ImportedImage, ImportedModel
+from mapping.importers.reading.photo_names import natural_order
 from mapping.methods.sparse.intrinsics import FROM_EXIF
 from visloc.errors import InvalidInput, NotFound, TooLarge, VislocError, refuse
 from visloc.file_kinds import HEAD_BYTES, FileKind, file_kind
 from visloc.geometry import Camera
-from visloc.images import FILE_LIMITS, exif_text, read_exif, read_photo
+from visloc.images import FILE_LIMITS, Photo, exif_text, read_exif, read_photo
 from visloc.kapture import GnssRecord, Sensor
 from visloc.kapture.dataset import UNKNOWN_CAMERA
-from visloc.photo_formats import FORMATS, SUFFIXES
+from visloc.kapture.text import is_path_field
+from visloc.photo_formats import FORMATS, PNG_GREY, SUFFIXES, png_samples
 
 _GNSS = "gnss"
 # Some programs write words in place of the letters of EXIF.
@@ -36,6 +40,13 @@ _SYSTEM_NAMES = {"thumbs.db", "desktop.ini", "@eadir", "__macosx", "$recycle.bin
 _SYSTEM = "hidden, or of the operating system"
 _LINKED = "links out of the folder and linked folders are not followed"
 _RENAME = f"photos whose names do not end in {', '.join(sorted(SUFFIXES))}: rename them"
+_UNSTORABLE = (
+    "a dataset cannot store names with commas, backslashes, tabs, line breaks, blanks at an end or "
+    "bytes that are not UTF-8: rename them"
+)
+_LIVE = "films that a phone took around photos: the photos are used"
+_DEPTH, _FEW_LEVELS = "depth maps, grey of 16 bits", "masks or maps of confidence, not photos"
+_LEAST_LEVELS = 4  # of a grey PNG that is a photo
 # What Pillow raises on malformed EXIF beside giving none; found by fuzzing ``visloc.images``.
 _MALFORMED = (
     *(OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, AttributeError),
@@ -57,6 +68,7 @@ class _Found:
         fix: longitude, latitude in degrees; None without; why it cannot be used.
         altitude_m: above sea level; None without.
         dop: dilution of precision, 0 when unknown.
+        doubt: why it is no photo if there are others beside it; None for a photo.
     """
 
     name: str
@@ -68,6 +80,7 @@ class _Found:
     fix: tuple[float, float] | str | None
     altitude_m: float | None
     dop: float
+    doubt: str | None
 
 
 @dataclass(slots=True)
@@ -75,7 +88,7 @@ class _Files:
     """The files of a folder, by path relative to it.
 
     Attributes:
-        photos: those that may be photos, in the order of their names.
+        photos: those that may be photos, in the natural order of their names.
         left_out: the others by reason, as in ``ImportedModel``.
     """
 
@@ -152,7 +165,7 @@ def _sort_by_time(found: list[_Found]) -> list[str]:
     """Sort the photos by their EXIF time where all have one; else say why not."""
     dated = [photo for photo in found if photo.taken is not None]
     if len(dated) == len(found):
-        found.sort(key=lambda photo: (photo.taken or "", photo.name))
+        found.sort(key=lambda photo: (photo.taken or "", natural_order(photo.name)))
     elif dated:
         return [
             f"{len(found) - len(dated)} photos have no EXIF time: the order is that of the names"
@@ -170,7 +183,13 @@ def _read_photos(path: Path, files: _Files, progress: Callable[[int, int], None]
         except InvalidInput as error:
             files.leave_out(name, _reason(error))
     progress(len(files.photos), len(files.photos))
-    return found
+    photos = [photo for photo in found if photo.doubt is None]
+    if not photos:
+        return found
+    for photo in found:
+        if photo.doubt is not None:
+            files.leave_out(photo.name, photo.doubt)
+    return photos
 
 
 def _not_a_folder(file: Path) -> VislocError:
@@ -209,14 +228,18 @@ def _files_in(folder: Path) -> _Files:
             else:
                 entered.append(name)
         folders[:] = entered
-        for name in sorted(files):
-            path = Path(where) / name
-            reason = _why_not_read(path, inside)
+        stems = stems_of_photos(files)
+        for file in sorted(files):
+            path = Path(where) / file
+            name = path.relative_to(folder).as_posix()
+            reason = _why_not_read(path, inside, stems)
+            if reason is None and not is_path_field(name):
+                reason = _UNSTORABLE
             if reason is None:
-                found.photos.append(path.relative_to(folder).as_posix())
+                found.photos.append(name)
             else:
-                found.leave_out(path.relative_to(folder).as_posix(), reason)
-    found.photos.sort()
+                found.leave_out(name, reason)
+    found.photos.sort(key=natural_order)
     return found
 
 
@@ -224,8 +247,12 @@ def _is_of_system(name: str) -> bool:
     return name.startswith(".") or name.lower() in _SYSTEM_NAMES
 
 
-def _why_not_read(path: Path, inside: Path) -> str | None:
-    """Return why a file is not read as a photo; None for one that is to be read."""
+def _why_not_read(path: Path, inside: Path, stems: Set[str]) -> str | None:
+    """Return why a file is not read as a photo; None for one that is to be read.
+
+    Args:
+        stems: of the photos beside it.
+    """
     if _is_of_system(path.name):
         return _SYSTEM
     if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(inside):
@@ -237,6 +264,8 @@ def _why_not_read(path: Path, inside: Path) -> str | None:
     kind = _kind_of(path)
     if kind is None:
         return "not photos"
+    if is_live_photo(path, stems):
+        return _LIVE
     return _RENAME if kind.is_read else kind.refusal
 
 
@@ -272,7 +301,18 @@ def _read_photo(folder: Path, name: str) -> _Found:
         fix=_fix(gps),
         altitude_m=_altitude(gps),
         dop=max(_number(gps.get(ExifTags.GPS.GPSDOP)) or 0.0, 0.0),
+        doubt=_doubt(data, photo),
     )
+
+
+def _doubt(data: bytes, photo: Photo) -> str | None:
+    """Return what a grey PNG is that scanning apps write beside photos; None for a photo."""
+    bits, colour = png_samples(data) or (0, None)
+    if colour != PNG_GREY:
+        return None
+    if bits == 16:
+        return _DEPTH
+    return _FEW_LEVELS if len(np.unique(photo.rgb[..., 0])) < _LEAST_LEVELS else None
 
 
 def _reason(error: InvalidInput) -> str:

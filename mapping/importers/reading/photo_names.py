@@ -17,6 +17,7 @@ from visloc.photo_formats import PhotoHeader, open_header
 
 T = TypeVar("T")
 
+_DIGITS = re.compile(r"([0-9]+)")
 _SWAPPING = (5, 6, 7, 8)  # EXIF orientations
 _WINDOWS_DRIVE = re.compile(r"[A-Za-z]:/")
 
@@ -77,6 +78,15 @@ def _relative(text: str, base: Path, photos: Path, folder: str) -> tuple[str, bo
     if is_inside and (leads_out or (not _is_file(photos / plain) and _is_file(Path(full)))):
         return full.relative_to(folder).as_posix(), False
     return (full.name, True) if leads_out else (plain, False)
+
+
+def natural_order(name: str) -> tuple[tuple[int, str], ...]:
+    """Return the key that sorts ``frame_2.jpg`` before ``frame_10.jpg``."""
+    key = []
+    for at, part in enumerate(_DIGITS.split(name)):
+        number = part.lstrip("0")  # the longer is the greater; int() refuses very long ones
+        key.append((len(number), number) if at % 2 else (0, part))
+    return (*key, (0, name))
 
 
 def photo_size(path: Path) -> tuple[int, int] | None:

@@ -14,7 +14,7 @@ from mapping.capture.sources import find_sources, read_capture, study_videos
 from mapping.importers import write_imported
 from mapping.stages.work_folder import WorkFolder
 from tests.mapping.capture.conftest import panned
-from visloc.errors import InvalidInput, NotFound
+from visloc.errors import DatasetError, InvalidInput, NotFound
 from visloc.kapture import read_dataset
 
 MakeVideo = Callable[..., Path]
@@ -38,7 +38,7 @@ def test_videos_and_folders_become_one_dataset(make_video: MakeVideo, tmp_path: 
     sources = find_sources([film, folder])
     assert set(sources.videos) == {"walk", "second"}
     work = tmp_path / "work"
-    videos = study_videos(sources, WorkFolder(work), 10, {}, quiet)
+    sources, videos = study_videos(sources, WorkFolder(work), 10, {}, quiet)
     model = read_capture(sources, videos, work, quiet)
     write_imported(model, tmp_path / "dataset")
     dataset = read_dataset(tmp_path / "dataset")
@@ -117,7 +117,7 @@ def test_what_is_not_there_or_no_video(tmp_path: Path) -> None:
 def test_wanted_moments_become_photos(make_video: MakeVideo, tmp_path: Path) -> None:
     film = make_video(panned(40, step=8))
     sources = find_sources([film])
-    videos = study_videos(sources, WorkFolder(tmp_path / "w"), 4, {"walk": [1.7]}, quiet)
+    _, videos = study_videos(sources, WorkFolder(tmp_path / "w"), 4, {"walk": [1.7]}, quiet)
     assert "00001.700s.jpg" in videos["walk"].names
     assert np.isclose(videos["walk"].motion.seconds[-1], 3.9)
 
@@ -139,9 +139,72 @@ def test_a_video_that_was_cut_while_it_was_copied_is_told(
         copied.parent.mkdir()
         copied.write_bytes(film.read_bytes()[: int(share * film.stat().st_size)])
         sources = find_sources([copied])
-        videos = study_videos(sources, WorkFolder(tmp_path / name / "work"), 10, {}, quiet)
+        _, videos = study_videos(sources, WorkFolder(tmp_path / name / "work"), 10, {}, quiet)
         notes[name] = read_capture(sources, videos, tmp_path / name / "work", quiet).notes
 
     assert notes["whole"] == ()
     (note,) = notes["cut"]
     assert "says that it lasts 6.0 s" in note
+
+
+@pytest.mark.parametrize(
+    ("photo", "film", "is_one"),
+    [
+        ("IMG_0001.JPG", "IMG_0001.MOV", True),
+        ("IMG_0001.jpg", "img_0001.mov", True),
+        ("IMG_0001.JPG", "IMG_0001_HEVC.MOV", True),  # as icloudpd names them
+        ("PXL_1.MP.jpg", "PXL_1.MP.mp4", True),
+        ("IMG_0001.JPG", "IMG_0002.MOV", False),
+        ("IMG_0001.JPG", "long/IMG_0001.MOV", False),
+    ],
+)
+def test_films_of_live_photos_are_left_out(
+    make_video: MakeVideo, tmp_path: Path, photo: str, film: str, is_one: bool
+) -> None:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    Image.new("RGB", (320, 240), (9, 90, 40)).save(folder / photo)
+    seconds = 7 if film.startswith("long/") else 3  # of the same name, but a film of its own
+    film = film.removeprefix("long/")
+    made = make_video(panned(seconds * 10, step=4), f"made{Path(film).suffix.lower()}")
+    shutil.move(made, folder / film)
+    sources = find_sources([folder])
+    assert (set(sources.videos.values()) == set()) == is_one
+    sources, videos = study_videos(sources, WorkFolder(tmp_path / "work"), 10, {}, quiet)
+    model = read_capture(sources, videos, tmp_path / "work", quiet)
+    left_out = {name: why for why, names in model.left_out.items() for name in names}
+    assert list(left_out) == ([f"photos/{film}"] if is_one else [])
+    assert all("the photos are used" in why for why in left_out.values())
+    assert len(model.images) == (1 if is_one else 1 + len(videos[Path(film).stem].names))
+
+
+def test_one_bad_film_of_a_folder_is_left_out(make_video: MakeVideo, tmp_path: Path) -> None:
+    folder = tmp_path / "films"
+    folder.mkdir()
+    shutil.move(make_video(panned(20, step=8)), folder / "good.mp4")
+    still = shutil.move(make_video([panned(1, step=0)[0]] * 20), folder / "still.mp4")
+    (folder / "cut.mp4").write_bytes((folder / "good.mp4").read_bytes()[:2000])
+    sources = find_sources([folder])
+    sources, videos = study_videos(sources, WorkFolder(tmp_path / "work"), 10, {}, quiet)
+    assert set(videos) == set(sources.videos) == {"good"}
+    model = read_capture(sources, videos, tmp_path / "work", quiet)
+    left_out = {name: why for why, names in model.left_out.items() for name in names}
+    assert "did not move" in left_out.pop("films/still.mp4")
+    assert "copy it again" in left_out.pop("films/cut.mp4")
+    assert left_out == {}
+    named = find_sources([folder, still])  # named twice: found in the folder first
+    assert "still" in named.found
+    with pytest.raises(InvalidInput) as refused:  # the film that was asked for
+        study_videos(find_sources([still]), WorkFolder(tmp_path / "w"), 10, {}, quiet)
+    assert refused.value.code == "capture.still"
+
+
+def test_a_folder_of_nothing_but_bad_films_says_why(make_video: MakeVideo, tmp_path: Path) -> None:
+    folder = tmp_path / "films"
+    folder.mkdir()
+    shutil.move(make_video([panned(1, step=0)[0]] * 20), folder / "still.mp4")
+    sources = find_sources([folder])
+    sources, videos = study_videos(sources, WorkFolder(tmp_path / "work"), 10, {}, quiet)
+    with pytest.raises(DatasetError, match=r"did not move.*films/still\.mp4") as refused:
+        read_capture(sources, videos, tmp_path / "work", quiet)
+    assert refused.value.code == "import.empty"

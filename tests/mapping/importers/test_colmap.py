@@ -121,6 +121,27 @@ def test_a_camera_that_no_photo_has_is_left_out_where_kapture_lacks_its_model(
     assert any("left out" in note and "SIMPLE_DIVISION" in note for note in model.notes)
 
 
+@pytest.mark.parametrize("write", [write_text, write_binary])
+def test_names_of_windows_are_paths_below_the_photos(
+    tmp_path: Path, write: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = {"b/two.jpg": r"C:\scan\two.jpg", "a/0.jpg": r"a\0.jpg", "a/one.jpg": r".\a\one.jpg"}
+    images = IMAGES
+    for name, windows in names.items():
+        images = images.replace(name, windows)
+    monkeypatch.setattr("tests.mapping.importers.test_colmap.IMAGES", images)
+    model = read(write(tmp_path / "model"))
+    assert {image.name for image in model.images} == {"two.jpg", "a/0.jpg", "a/one.jpg"}
+    assert any(r"their last part was taken: C:\scan\two.jpg" in note for note in model.notes)
+
+
+def test_ranks_count_numbers_in_names_as_numbers(tmp_path: Path) -> None:
+    images = IMAGES.replace("b/two", "f_10").replace("a/0", "f_9").replace("a/one", "f_100")
+    model = read(write_text(tmp_path, images=images))
+    assert [image.name for image in model.images] == ["f_9.jpg", "f_10.jpg", "f_100.jpg"]
+    assert [image.timestamp for image in model.images] == [0, 1, 2]
+
+
 def test_a_real_model_becomes_a_dataset_with_the_same_cameras_poses_and_points(
     lund: Path, tmp_path: Path
 ) -> None:

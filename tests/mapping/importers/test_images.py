@@ -4,6 +4,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from PIL import ExifTags, Image
 from PIL.TiffImagePlugin import IFDRational
@@ -233,6 +234,59 @@ def test_every_file_is_used_or_left_out_with_its_reason(tmp_path: Path) -> None:
         "@eaDir/": "of the operating system",
     }.items():
         assert part in reasons[name]
+
+
+def test_names_that_a_dataset_cannot_store_are_left_out_all_at_once(tmp_path: Path) -> None:
+    folder = tmp_path / "in"
+    write_photo(folder / "good.jpg")
+    content = (folder / "good.jpg").read_bytes()
+    bad = [
+        *(b"IMG_0001, Kopie.jpg", b" lead.jpg", b"tab\there.jpg", b"two\nlines.jpg"),
+        *(b"f\xfcr.jpg", b"back\\slash.jpg", b"a,b/inside.jpg"),
+    ]
+    good = ["trail .jpg", "a b.jpg", "K\u00fcche (1).jpg", "%20.jpg", 'a"b.jpg', "\U0001f600.jpg"]
+    (folder / "a,b").mkdir()
+    for name in [*bad, *map(os.fsencode, good)]:
+        (folder / os.fsdecode(name)).write_bytes(content)
+    notes = import_dataset("images", folder, tmp_path / "out").notes
+    dataset = read_dataset(tmp_path / "out")
+    assert {record.path for record in dataset.images} == {"good.jpg", *good}
+    assert all(dataset.has_file(record) for record in dataset.images)
+    assert any(f"{len(bad)} left out (a dataset cannot store names" in note for note in notes)
+    listed = (tmp_path / "out.left-out.txt").read_text()
+    shown = [os.fsdecode(name) for name in bad]
+    assert all((name if name.isprintable() else ascii(name)) in listed for name in shown)
+
+
+def test_numbers_in_names_count_as_numbers(tmp_path: Path) -> None:
+    ordered = ["frame_1.jpg", "frame_2.jpg", "frame_10.jpg", "frame_10b.jpg", "frame_100.jpg"]
+    for name in reversed(ordered):
+        write_photo(tmp_path / name)
+    assert [image.name for image in read(tmp_path).images] == ordered
+    for name in ordered:  # taken at the same time
+        write_photo(tmp_path / name, details=taken("2024:05:06 07:08:10"))
+    assert [image.name for image in read(tmp_path).images] == ordered
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "reason"),
+    [
+        ("depth.png", np.arange(64 * 48, dtype=np.uint16).reshape(48, 64), "depth maps"),
+        ("conf.png", np.arange(64 * 48, dtype=np.uint8).reshape(48, 64) % 3, "masks or maps"),
+        ("mask.png", np.full((48, 64), 255, np.uint8), "masks or maps"),
+        ("grey.png", np.arange(64 * 48, dtype=np.uint32).reshape(48, 64).astype(np.uint8), None),
+        ("colour.png", np.zeros((48, 64, 3), np.uint8), None),
+    ],
+)
+def test_depth_and_confidence_are_no_photos(
+    tmp_path: Path, name: str, value: Any, reason: str | None
+) -> None:
+    Image.fromarray(value).save(tmp_path / name)
+    assert [image.name for image in read(tmp_path).images] == [name]  # nothing else is there
+    write_photo(tmp_path / "photo.jpg")
+    model = read(tmp_path)
+    assert len(model.images) == (1 if reason else 2)
+    assert all(why.startswith(reason or "?") for why in model.left_out)
 
 
 def test_what_is_left_out_is_counted_in_notes_and_listed_beside_the_dataset(tmp_path: Path) -> None:
