@@ -8,6 +8,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 # ``file_kind`` needs this many bytes of a file.
 HEAD_BYTES = 4096
@@ -90,6 +91,13 @@ _SIGNATURES: tuple[tuple[bytes, FileKind], ...] = (
     (b"8BPS", _photos("Photoshop", "save them as PNG")),
     (b"<svg", _SVG),
 )
+# Cameras and poses, by what stands near the beginning of the text.
+_EXPORTS: tuple[tuple[bytes, str], ...] = (
+    (b"xmlns:xcr=", "RealityCapture"),  # XMP beside each photo
+    (b"#name,x,y,", "RealityCapture"),  # CSV
+    (b"<document version=", "Metashape"),
+    (b"<BlocksExchange", "ContextCapture"),
+)
 _RIFF = {b"WEBP": _photos("WebP"), b"AVI ": _other_video("AVI")}
 # Brands of ISO base media files (ISO/IEC 14496-12, 23008-12), the telling ones first.
 _BRANDS: tuple[tuple[tuple[bytes, ...], FileKind], ...] = (
@@ -119,7 +127,24 @@ def file_kind(head: bytes) -> FileKind | None:
         return _RAW
     if found is None and head.startswith(b"<?xml") and b"<svg" in head:
         return _SVG
-    return found
+    return found or next((_poses(by) for text, by in _EXPORTS if text in head), None)
+
+
+def _poses(program: str) -> FileKind:
+    return FileKind(
+        f"poses of {program}",
+        f"poses of {program}",
+        "export its cameras as COLMAP or Bundler, then: mapping import colmap FOLDER --map ID",
+    )
+
+
+def kind_of(path: Path) -> FileKind | None:
+    """Tell the kind of a file; None for one that is not known or cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return file_kind(file.read(HEAD_BYTES))
+    except OSError:
+        return None
 
 
 def _of_brands(head: bytes) -> FileKind | None:

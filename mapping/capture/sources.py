@@ -18,6 +18,7 @@ from mapping.methods.sparse.intrinsics import FROM_EXIF
 from mapping.progress import Progress
 from mapping.stages.work_folder import WorkFolder
 from visloc.errors import DatasetError, VislocError, refuse
+from visloc.file_kinds import kind_of
 from visloc.geometry import Camera
 from visloc.kapture import GnssRecord, Sensor
 from visloc.kapture.dataset import UNKNOWN_CAMERA
@@ -94,7 +95,10 @@ def find_sources(paths: Sequence[Path]) -> Sources:
         elif path.is_file() and is_video(path):
             videos[_new_name(path.stem, taken)] = path
         else:
-            raise refuse("capture.video", field=str(path), got="another kind of file")
+            kind = kind_of(path) if path.is_file() else None  # a pipe would never end
+            got = "another kind of file" if kind is None else kind.name
+            expected = f"a video; {kind.refusal}" if kind is not None and kind.advice else None
+            raise refuse("capture.video", field=str(path), got=got, expected=expected)
     return Sources(videos, folders, exports, found)
 
 

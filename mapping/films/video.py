@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from mapping.films.tone import is_high_range, to_standard_range
 from visloc.errors import VislocError, refuse
-from visloc.file_kinds import HEAD_BYTES, file_kind
+from visloc.file_kinds import HEAD_BYTES, file_kind, kind_of
 from visloc.images import ImageLimits
 from visloc.photo_formats import SUFFIXES as PHOTO_SUFFIXES
 
@@ -133,11 +133,7 @@ class Frame:
 
 def is_video(path: Path) -> bool:
     """Tell a video that is read here by its first bytes."""
-    try:
-        with path.open("rb") as file:
-            kind = file_kind(file.read(HEAD_BYTES))
-    except OSError:
-        return False
+    kind = kind_of(path)
     return kind is not None and kind.name in _DEMUXERS
 
 

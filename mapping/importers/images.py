@@ -21,7 +21,7 @@ from mapping.importers.model import ImportedImage, ImportedModel
 from mapping.importers.reading.photo_names import natural_order
 from mapping.methods.sparse.intrinsics import FROM_EXIF
 from visloc.errors import InvalidInput, NotFound, TooLarge, VislocError, refuse
-from visloc.file_kinds import HEAD_BYTES, FileKind, file_kind
+from visloc.file_kinds import kind_of
 from visloc.geometry import Camera
 from visloc.images import FILE_LIMITS, Photo, exif_text, read_exif, read_photo
 from visloc.kapture import GnssRecord, Sensor
@@ -193,7 +193,7 @@ def _read_photos(path: Path, files: _Files, progress: Callable[[int, int], None]
 
 
 def _not_a_folder(file: Path) -> VislocError:
-    kind = _kind_of(file)
+    kind = kind_of(file)
     if kind is None:
         advice = "name the folder that it lies in"
     elif kind.is_read:
@@ -261,20 +261,12 @@ def _why_not_read(path: Path, inside: Path, stems: Set[str]) -> str | None:
         return "neither files nor folders"
     if path.suffix.lower() in SUFFIXES:
         return None
-    kind = _kind_of(path)
+    kind = kind_of(path)
     if kind is None:
         return "not photos"
     if is_live_photo(path, stems):
         return _LIVE
     return _RENAME if kind.is_read else kind.refusal
-
-
-def _kind_of(path: Path) -> FileKind | None:
-    try:
-        with path.open("rb") as file:
-            return file_kind(file.read(HEAD_BYTES))
-    except OSError:
-        return None
 
 
 def _read_photo(folder: Path, name: str) -> _Found:

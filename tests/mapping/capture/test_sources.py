@@ -114,6 +114,21 @@ def test_what_is_not_there_or_no_video(tmp_path: Path) -> None:
     assert refused.value.code == "capture.video"
 
 
+@pytest.mark.parametrize(
+    ("data", "part"),
+    [
+        (b"RIFF\0\0\0\0AVI LIST", "AVI videos are not read here; take frames out"),
+        (b'<?xml version="1.0"?>\n<document version="2.0.0">', "poses of Metashape are not read"),
+        (b"hello", "another kind of file"),
+    ],
+)
+def test_files_of_another_kind_are_named(tmp_path: Path, data: bytes, part: str) -> None:
+    (tmp_path / "file").write_bytes(data)
+    with pytest.raises(InvalidInput, match=part) as refused:
+        find_sources([tmp_path / "file"])
+    assert refused.value.code == "capture.video"
+
+
 def test_wanted_moments_become_photos(make_video: MakeVideo, tmp_path: Path) -> None:
     film = make_video(panned(40, step=8))
     sources = find_sources([film])
