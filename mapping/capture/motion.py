@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mapping.films.sharpness import SHARPNESS_SIDE, sharpness
 from mapping.films.video import Frame
 
-# Motion blur of a pixel or two is visible at this size, and corners are tracked at a third of it.
-_SHARPNESS_SIDE, _TRACKING_SIDE = 960, 320
+_TRACKING_SIDE = 320
 _CORNERS, _LEAST_CORNERS = 150, 12
 # A new reference when corners moved by so much of the longer side, or so many of them were lost.
 _FAR, _LEAST_KEPT = 0.1, 0.5
@@ -103,11 +103,10 @@ def measure_motion(frames: Iterable[Frame]) -> Motion:
     """Measure every frame of a video; one frame is in memory at a time."""
     tracker, rows = _Tracker(), []
     for frame in frames:
-        grey = frame.grey(_SHARPNESS_SIDE)
-        sharpness = float(cv2.Laplacian(cv2.GaussianBlur(grey, (3, 3), 0), cv2.CV_32F).var())
+        grey = frame.grey(SHARPNESS_SIDE)
         scale = min(1.0, _TRACKING_SIDE / max(grey.shape))
         size = max(1, round(grey.shape[1] * scale)), max(1, round(grey.shape[0] * scale))
         small = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
-        rows.append((frame.seconds, sharpness, tracker.step(small)))
+        rows.append((frame.seconds, sharpness(grey), tracker.step(small)))
     seconds, sharp, path = np.array(rows, np.float64).reshape(-1, 3).T
     return Motion(seconds, sharp, path)

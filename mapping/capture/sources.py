@@ -14,6 +14,7 @@ from mapping.films.video import SUFFIXES, is_live_photo, is_video, stems_of_phot
 from mapping.importers import ImportedImage, ImportedModel, read_model
 from mapping.importers.left_out import LeftOut, notes_on
 from mapping.importers.reading.photo_names import natural_order, photo_size
+from mapping.importers.scans.recognition import app_of
 from mapping.methods.sparse.intrinsics import FROM_EXIF
 from mapping.progress import Progress
 from mapping.stages.work_folder import WorkFolder
@@ -23,7 +24,7 @@ from visloc.geometry import Camera
 from visloc.kapture import GnssRecord, Sensor
 from visloc.kapture.dataset import UNKNOWN_CAMERA
 
-_EXPORT = "transforms.json"
+_EXPORT, _NERFSTUDIO = "transforms.json", "nerfstudio"
 _GNSS = "gnss"
 # A video whose frames end so long before the end that it states may have been cut.
 _CUT_S = 1.0
@@ -38,14 +39,14 @@ class Sources:
     Attributes:
         videos: files.
         folders: of photos.
-        exports: folders or files of nerfstudio's format.
+        exports: scans of apps, and folders or files of nerfstudio's format, with their importers.
         found: names of the videos that were found in folders.
         left_out: videos of folders that cannot be used, by reason.
     """
 
     videos: Mapping[str, Path]
     folders: Mapping[str, Path]
-    exports: Mapping[str, Path]
+    exports: Mapping[str, tuple[str, Path]]
     found: Set[str] = frozenset()
     left_out: LeftOut = field(default_factory=dict)
 
@@ -62,21 +63,24 @@ def find_sources(paths: Sequence[Path]) -> Sources:
     """
     videos: dict[str, Path] = {}
     folders: dict[str, Path] = {}
-    exports: dict[str, Path] = {}
+    exports: dict[str, tuple[str, Path]] = {}
     found: set[str] = set()
     taken: set[str] = set()
     counted: set[str] = set()
     for path in paths:
         if not path.exists():
             raise refuse("capture.source", field=str(path))
+        app = app_of(path)
         is_export = path.is_dir() and (path / _EXPORT).is_file()
         # Unlike Path.resolve, this does not raise for a link that leads to itself.
         place = os.path.realpath(path / _EXPORT if is_export else path)
         if place in counted:
             continue
         counted.add(place)
-        if is_export:
-            exports[_new_name(path.resolve().name, taken)] = path
+        if app is not None:
+            exports[_new_name(path.resolve().name, taken)] = app, path
+        elif is_export:
+            exports[_new_name(path.resolve().name, taken)] = _NERFSTUDIO, path
         elif path.is_dir():
             folders[_new_name(path.resolve().name, taken)] = path
             files = sorted(path.iterdir(), key=lambda file: natural_order(file.name))
@@ -91,7 +95,7 @@ def find_sources(paths: Sequence[Path]) -> Sources:
                     videos[name] = file
                     found.add(name)
         elif path.suffix.lower() == ".json" and path.is_file():  # a pipe would never end
-            exports[_new_name(path.resolve().parent.name, taken)] = path
+            exports[_new_name(path.resolve().parent.name, taken)] = _NERFSTUDIO, path
         elif path.is_file() and is_video(path):
             videos[_new_name(path.stem, taken)] = path
         else:
@@ -159,8 +163,11 @@ def read_capture(
     for name, path in sources.folders.items():
         if (model := _read_folder(path, progress, sources)) is not None:
             parts[name] = model
-    for name, path in sources.exports.items():
-        parts[name] = read_model("nerfstudio", path, None, progress)
+    for name, (importer, path) in sources.exports.items():
+        written = work / "scans" / name  # the photos and depth maps of a scan
+        written.mkdir(parents=True, exist_ok=True)
+        into = None if importer == _NERFSTUDIO else written
+        parts[name] = read_model(importer, path, into, progress)
     if not parts:
         raise refuse(
             "import.empty",

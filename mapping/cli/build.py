@@ -24,8 +24,9 @@ from mapping.cli.display import (
 )
 from mapping.cli.progress import StageProgress
 from mapping.cluster.stage_timings import Costs
-from mapping.cluster.storage import is_map_folder, open_store, scratch_folder
+from mapping.cluster.storage import is_map_folder, is_remote, open_store, scratch_folder
 from mapping.importers import IMPORTERS, MASKS, ImportSummary, import_dataset, imported
+from mapping.importers.scans.recognition import refuse_scan
 from mapping.methods.rgbd import DepthSettings
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.options import (
@@ -102,6 +103,8 @@ def build(settings: BuildSettings, covisible_in: CovisibleInOption = None) -> No
             folder = open_store(settings.maps_dir, settings.cache_dir).folder(covisible_in)
         sfm = replace(settings.sfm, covisible_in=open_map(folder))
         settings = replace(settings, sfm=sfm)
+    if not is_remote(settings.dataset):
+        refuse_scan(settings.dataset)
     _build(settings)
 
 

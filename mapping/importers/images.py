@@ -19,6 +19,7 @@ from mapping.films.video import is_live_photo, stems_of_photos
 from mapping.importers.left_out import notes_on
 from mapping.importers.model import ImportedImage, ImportedModel
 from mapping.importers.reading.photo_names import natural_order
+from mapping.importers.scans.recognition import refuse_scan
 from mapping.methods.sparse.intrinsics import FROM_EXIF
 from visloc.errors import InvalidInput, NotFound, TooLarge, VislocError, refuse
 from visloc.file_kinds import kind_of
@@ -109,7 +110,8 @@ def read(
     unknown intrinsics. ``left_out`` of the model lists unused files with the reason.
 
     Raises:
-        InvalidInput: ``import.photos`` if ``photos`` is given; ``import.folder`` for a file.
+        InvalidInput: ``import.photos`` if ``photos`` is given; ``import.folder`` for a file;
+            ``import.scan`` if it holds the scan of an app.
         NotFound: ``import.missing`` if there is no such folder.
         DatasetError: ``import.empty`` if it holds no readable photo.
     """
@@ -218,6 +220,7 @@ def _files_in(folder: Path) -> _Files:
         found.leave_out(f"{name}/", f"folders that cannot be read: {error.strerror}")
 
     for where, folders, files in os.walk(folder, onerror=unreadable):
+        refuse_scan(Path(where))  # its depth and confidence would become photos
         entered = []
         for name in sorted(folders):
             path = Path(where) / name

@@ -25,6 +25,10 @@ from visloc.errors import DatasetError, InvalidInput, VislocError, refuse
 from visloc.geometry import MAX_IMAGE_SIDE, Camera, Pose
 from visloc.kapture import Sensor
 
+UNKNOWN_UNIT = (
+    "nothing says that a unit of the world is a metre: it is if a recorder with ARKit, ARCore or "
+    "lidar gave the poses, and is not if they came from COLMAP"
+)
 _FILE = "transforms.json"
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
 _OURS_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
@@ -72,8 +76,16 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
         photos: folder that ``file_path`` is relative to; None takes that of the file.
     """
     file = path / _FILE if path.is_dir() else path
-    top = read_json(file)
-    folder = file.parent if photos is None else photos
+    return read_recording(read_json(file), file.parent if photos is None else photos)
+
+
+def read_recording(top: JsonValue, folder: Path) -> ImportedModel:
+    """Read the content of a ``transforms.json``, as ``read``.
+
+    Args:
+        folder: of the photos.
+    """
+    file = top.file
     frames = top["frames"].elements()
     paths = [frame["file_path"] for frame in frames]
     raw = [(path.text(), path.where) for path in paths]
@@ -94,10 +106,7 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
     in_metres = any(frame.get_set("depth_file_path") is not None for frame in frames)
     metric = with_depth and in_metres and not is_scaled
     if not metric:
-        notes.append(
-            "nothing says that a unit of the world is a metre: it is if a recorder with ARKit, "
-            "ARCore or lidar gave the poses, and is not if they came from COLMAP"
-        )
+        notes.append(UNKNOWN_UNIT)
     return ImportedModel(
         sensors=seen.sensors,
         images=images,

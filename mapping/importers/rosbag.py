@@ -22,16 +22,15 @@ from numpy.typing import NDArray
 from mapping.importers.dataset import depth_sensor_id
 from mapping.importers.model import ImportedImage, ImportedModel
 from mapping.importers.reading.photo_names import photo_size
+from mapping.importers.reading.steps import has_moved
 from mapping.stages.depth import DEFAULT_DEPTH_SCALE
 from visloc.errors import DatasetError, refuse
-from visloc.geometry import Camera, Pose, rotation_angle
+from visloc.geometry import Camera, Pose
 from visloc.kapture import Sensor
 from visloc.kapture.dataset import UNKNOWN_CAMERA
 from visloc.rosbag import Bag, Picture, depth_in_metres, open_bag
 
-# A photo is taken when the camera has moved so far since the last one.
-_STEP_M, _TURN_RAD = 0.25, np.radians(10.0)
-# Without poses, when so long has passed.
+# Without poses, a photo is taken when so long has passed since the last one.
 _STEP_NS = 500_000_000
 _SAME_TIME_NS = 20_000_000  # a depth picture of the same moment
 _MOST_UNITS = np.iinfo(np.uint16).max
@@ -152,8 +151,7 @@ def _is_new(last: tuple[int, Pose | None] | None, time_ns: int, pose: Pose | Non
         return True
     if pose is None or last[1] is None:
         return abs(time_ns - last[0]) >= _STEP_NS
-    moved = float(np.linalg.norm(pose.translation - last[1].translation))
-    return moved >= _STEP_M or rotation_angle(pose.rotation @ last[1].rotation.T) >= _TURN_RAD
+    return has_moved(last[1].inverse(), pose.inverse())
 
 
 def _suffix(picture: Picture) -> str:

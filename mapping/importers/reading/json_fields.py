@@ -178,13 +178,22 @@ def notes_on_unread(top: JsonValue) -> tuple[str, ...]:
 def read_json(path: Path) -> JsonValue:
     """Read a JSON file. Keys that occur twice in an object and NaN are refused."""
     try:
-        value = json.loads(
-            path.read_bytes(), parse_constant=_not_finite, object_pairs_hook=_unique_keys
-        )
+        data = path.read_bytes()
     except FileNotFoundError:
         raise refuse("import.missing", field=str(path)) from None
     except OSError as error:
         raise refuse("import.unreadable", field=str(path), got=error.strerror) from error
+    return parse_json(data, path)
+
+
+def parse_json(data: bytes, path: Path) -> JsonValue:
+    """Read the content of a JSON file, as ``read_json``.
+
+    Raises:
+        DatasetError: ``import.json``.
+    """
+    try:
+        value = json.loads(data, parse_constant=_not_finite, object_pairs_hook=_unique_keys)
     except (ValueError, RecursionError) as error:  # of the syntax, of the text's coding, of depth
         raise refuse("import.json", field=str(path), got=str(error)) from error
     return JsonValue(value, path)
