@@ -79,7 +79,7 @@ def _read(path: Path, scan: Path | zipfile.Path, photos: Path | None) -> Importe
             (folder / frame.name).write_bytes(file.read_bytes())
             size = photo_size(folder / frame.name)
             if size is None or not frame.camera.has_aspect_of(*size):
-                raise refuse("import.scan_camera", field=f"{path}: {file.name}", got=size)
+                raise refuse("import.scan_camera", field=str(path / file.name), got=size)
             frames.append(replace(frame, camera=frame.camera.scaled(*size)))
         notes += [
             f"{len(frames)} of {len(poses)} frames are used, where the camera has moved",

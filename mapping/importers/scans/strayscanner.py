@@ -48,6 +48,8 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
     with TextLines(matrix) as lines:
         rows = [_fields(lines, lines.next("three numbers"), 3) for _ in range(3)]
         (fx, _, cx), (_, fy, cy), _ = ([lines.to_number(field) for field in row] for row in rows)
+    if not film.is_file():
+        raise refuse("import.missing", field=str(film))
     facts = video_facts(film)
     camera = pinhole([fx, fy, cx, cy], (facts.width, facts.height), str(matrix))
     recorded, unused = _odometry(path, camera)

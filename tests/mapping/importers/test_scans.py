@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import zipfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +13,16 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from typer.testing import CliRunner
 
-from mapping.importers import import_dataset
+from mapping.capture.sources import find_sources, read_capture
+from mapping.cli.main import app as mapping_app
+from mapping.importers import import_dataset, read_model, write_imported
 from mapping.importers.scans.recognition import app_of
 from mapping.stages.depth import read_depth
 from samples.film import encode_video
 from tests.mapping.capture.test_video import turned
+from visloc.errors import DatasetError, InvalidInput, VislocError
 from visloc.geometry import Camera, Pose
 from visloc.images import read_photo_file
 from visloc.kapture import Dataset, FileRecord, read_dataset
@@ -268,3 +272,251 @@ def test_a_scan_becomes_a_dataset_with_the_true_cameras_poses_and_depth(
         if app != "nerfcapture":
             wanted[:, :64] = np.nan  # of low confidence
         np.testing.assert_allclose(metres, wanted, atol=0.00066)  # half of both units
+
+
+def test_of_each_stretch_of_a_film_the_sharpest_frame_is_used(
+    seen: list[Seen], tmp_path: Path
+) -> None:
+    frames = []
+    for frame in seen[::2]:  # the camera stands still for three frames, two of which are blurred
+        soft = cv2.GaussianBlur(cv2.imdecode(np.frombuffer(frame.jpeg, np.uint8), 1), (0, 0), 3)
+        blurred = replace(frame, jpeg=cv2.imencode(".jpg", soft)[1].tobytes())
+        frames += [blurred, frame, blurred]
+    write_stray_scanner(tmp_path / "scan", frames)
+    model = read_model("strayscanner", tmp_path / "scan")
+    assert [image.name for image in model.images] == [f"{row:06d}.jpg" for row in (1, 4, 7, 10)]
+    assert any("4 of 12 frames are used" in note for note in model.notes)
+
+
+@pytest.mark.parametrize("columns", [9, 13])
+def test_older_recordings_tell_one_camera_for_all_frames(
+    seen: list[Seen], tmp_path: Path, columns: int
+) -> None:
+    write_stray_scanner(tmp_path / "scan", seen[::2], columns=columns)
+    model = read_model("strayscanner", tmp_path / "scan")
+    (camera,) = (s.camera for s in model.sensors.values() if s.kind == "camera")
+    assert camera is not None
+    assert camera.params == seen[0].camera.params
+
+
+def edit(name: str, change: Callable[[str], str]) -> Callable[[Path], None]:
+    def edited(scan: Path) -> None:
+        (scan / name).write_text(change((scan / name).read_text()))
+
+    return edited
+
+
+def without_files(pattern: str) -> Callable[[Path], None]:
+    def removed(scan: Path) -> None:
+        for file in list(scan.glob(pattern)):
+            file.unlink()
+
+    return removed
+
+
+def with_json(name: str, **changes: Any) -> Callable[[Path], None]:
+    return edit(name, lambda text: json.dumps(json.loads(text) | changes))
+
+
+MIRRORED = np.diag([1.0, 1.0, -1.0, 1.0]).ravel().tolist()
+POLY, FRAME = "keyframes/corrected_cameras/1700000003.json", "frame_00004.json"
+
+
+LINES, MATRIX, TOP = "odometry.csv", "camera_matrix.csv", "transforms.json"
+DAMAGED: dict[str, list[tuple[Callable[[Path], None], str, str]]] = {
+    "strayscanner": [
+        # A film and odometry that do not belong together would give every photo a wrong pose.
+        (edit(LINES, lambda t: t.rsplit("\n", 2)[0]), "import.scan_frames", "rgb.mp4"),
+        (edit(LINES, lambda t: t + t.splitlines()[-1]), "import.scan_frames", "rgb.mp4"),
+        (edit(LINES, lambda t: t.replace("qw", "q_w", 1)), "import.line", f"{LINES}:1"),
+        (edit(LINES, lambda t: t.replace("0.0, 000000", "0.0", 1)), "import.line", f"{LINES}:2"),
+        (edit(LINES, lambda t: t.replace("000000", "nan", 1)), "import.line", f"{LINES}:2"),
+        (edit(MATRIX, lambda t: t.splitlines()[0]), "import.truncated", f"{MATRIX}:1"),
+        (edit(MATRIX, lambda t: t.replace("128", "999")), "import.scan_camera", MATRIX),
+        (without_files("rgb.mp4"), "import.missing", "rgb.mp4"),
+    ],
+    "polycam": [
+        (with_json(POLY, t_00=7), "import.scan_pose", POLY),
+        (with_json(POLY, t_22=None), "import.json", f"{POLY}: t_22"),
+        (with_json(POLY, width=1024, height=768), "import.scan_camera", POLY),
+        (with_json(POLY, width=10**9), "import.json", f"{POLY}: width"),
+        (without_files("keyframes/corrected_images/*"), "import.empty", "keyframes"),
+    ],
+    "3dscannerapp": [
+        (with_json(FRAME, cameraPoseARFrame=MIRRORED), "import.scan_pose", FRAME),
+        (with_json(FRAME, intrinsics=[1]), "import.json", f"{FRAME}: intrinsics"),
+        (with_json(FRAME, intrinsics=[9, 0, 99, 0, 9, 999, 0, 0, 1]), "import.scan_camera", FRAME),
+        (without_files("*.jpg"), "import.empty", ""),
+    ],
+    "record3d": [
+        (with_json("metadata", poses=[[0] * 7]), "pose.rotation", "metadata: poses[0]"),
+        (
+            with_json("metadata", perFrameIntrinsicCoeffs=[[9, 9, 64, 48]]),
+            *("import.json", "metadata: perFrameIntrinsicCoeffs"),
+        ),
+        (with_json("metadata", w=64), "import.scan_camera", "metadata"),
+        (with_json("metadata", h=100), "import.scan_camera", "0.jpg"),
+        (without_files("rgbd/*.jpg"), "import.empty", ""),
+    ],
+    "nerfcapture": [
+        (edit(TOP, lambda t: t.replace('"fl_x"', '"f"', 1)), "import.json", f"{TOP}: frames[0]"),
+        (edit(TOP, lambda t: t.replace('"frames"', '"f"', 1)), "import.json", TOP),
+    ],
+}
+
+
+@pytest.mark.parametrize(
+    ("app", "damage", "code", "field"),
+    [(app, *row) for app, rows in DAMAGED.items() for row in rows],
+)
+def test_what_is_wrong_with_a_scan_is_refused_by_name(
+    seen: list[Seen],
+    tmp_path: Path,
+    app: str,
+    damage: Callable[[Path], None],
+    code: str,
+    field: str,
+) -> None:
+    write = next(write for name, write, _ in WRITERS.values() if name == app)
+    scan = tmp_path / "scan"
+    write(scan, seen)
+    damage(scan)
+    with pytest.raises(VislocError) as refused:
+        read_model(app, scan)
+    assert (refused.value.code, refused.value.field) == (code, str(scan / field))
+    assert not (tmp_path / "scan_photos").exists()
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda data: data[: len(data) // 2],
+        lambda _: b"PK\x03\x04",
+        lambda data: data.replace(b"rgbd/0.jpg", b"rgbd/9.xyz"),
+        lambda data: data[:60] + bytes(40) + data[100:],
+    ],
+)
+def test_a_damaged_r3d_is_refused(
+    seen: list[Seen], tmp_path: Path, damage: Callable[[bytes], bytes]
+) -> None:
+    path = tmp_path / "walk.r3d"
+    write_r3d(path, seen[:1])
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(DatasetError) as refused:
+        read_model("record3d", path)
+    assert refused.value.code in ("import.unreadable", "import.empty", "import.missing")
+
+
+def test_an_r3d_of_huge_files_is_refused(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "bomb.r3d", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("metadata", bytes(130 * 2**20))
+    with pytest.raises(DatasetError, match="a file of 136314880 bytes"):
+        read_model("record3d", tmp_path / "bomb.r3d")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "part"),
+    [
+        ("keyframes/depth/1700000000.png", b"", "does not read this image format"),
+        ("keyframes/depth/1700000000.png", png(np.ones((96, 128), np.uint8)), "not a depth map"),
+        ("keyframes/depth/1700000000.png", png(np.ones((128, 96), np.uint16)), "the wrong size"),
+        ("keyframes/confidence/1700000000.png", png(np.ones((9, 9), np.uint8)), "another size"),
+        ("keyframes/depth/1700000000.png", None, "cannot be read"),
+    ],
+)
+def test_one_bad_depth_map_is_left_out_with_its_reason(
+    seen: list[Seen], tmp_path: Path, name: str, content: bytes | None, part: str
+) -> None:
+    write_polycam(tmp_path / "scan", seen)
+    (tmp_path / "scan" / name).unlink()
+    if content is not None:
+        put(tmp_path / "scan" / name, content)
+    model = read_model("polycam", tmp_path / "scan")
+    assert [image.depth is None for image in model.images] == [True] + [False] * 7
+    (note,) = (note for note in model.notes if note.startswith("1 left out (depth"))
+    assert part in note
+    assert note.endswith("1700000000.jpg")
+
+
+def test_colours_of_depth_are_not_taken_for_metres(seen: list[Seen], tmp_path: Path) -> None:
+    write_nerfcapture(tmp_path / "scan", seen)
+    picture = np.full((96, 128, 4), 255, np.uint8)
+    picture[..., :3] = np.arange(128, dtype=np.uint8)[:, None]
+    for file in (tmp_path / "scan" / "images").glob("*.depth.png"):
+        put(file, png(picture))
+    model = read_model("nerfcapture", tmp_path / "scan")
+    assert all(image.depth is None for image in model.images)
+    assert any("not the bytes of metres" in note for note in model.notes)
+
+
+def test_fields_that_are_not_read_are_named(seen: list[Seen], tmp_path: Path) -> None:
+    for name, (app, write, _) in WRITERS.items():
+        if app == "nerfcapture":  # as nerfstudio's
+            continue
+        write(tmp_path / name, seen)
+        notes = read_model(app, tmp_path / name).notes
+        (note,) = (note for note in notes if "fields are not used: " in note)
+        expected = {
+            "strayscanner": "d_y, distortion_center_x, timestamp",
+            "polycam": "blur_score",
+            "3dscannerapp": "frame_index, motionQuality",
+            "record3d": "dh, dw, fps",
+        }[app]
+        assert note.endswith(f"fields are not used: {expected}"), (name, notes)
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_scans_are_not_taken_for_photos_or_datasets(
+    seen: list[Seen], tmp_path: Path, name: str
+) -> None:
+    app, write, _ = WRITERS[name]
+    scan = tmp_path / "scans" / name
+    write(scan, seen[:2])
+    if scan.is_dir():
+        for folder in (scan, tmp_path / "scans"):  # also where it lies deeper
+            with pytest.raises(InvalidInput) as refused:
+                read_model("images", folder)
+            assert (refused.value.code, refused.value.field) == ("import.scan", str(scan))
+            assert f"mapping import {app} {scan} --map ID" in str(refused.value)
+    command = ["build", str(scan), "--map", "m", "--maps-dir", str(tmp_path / "maps")]
+    result = CliRunner().invoke(mapping_app, command)
+    assert isinstance(result.exception, InvalidInput)
+    assert result.exception.code == "import.scan"
+
+
+@pytest.mark.parametrize(
+    "files",
+    [
+        {"frame_0001.json": '{"shapes": []}', "frame_0001.jpg": ""},  # labels of photos
+        {"cameras/0.json": '{"fx": 1}', "images/0.jpg": ""},
+        {"metadata.json": '{"title": "poses"}'},
+        {"odometry.csv": "t, x, y"},
+        {"transforms.json": '{"frames": [{"depth_file_path": "0.png"}]}'},
+        {"frame_1.json": b"\xff\xfe\0", "metadata": b"\0" * 99},
+    ],
+)
+def test_other_folders_are_no_scans(tmp_path: Path, files: dict[str, bytes | str]) -> None:
+    for name, content in files.items():
+        put(tmp_path / name, content)
+    assert app_of(tmp_path) is None
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_capture_takes_scans_with_their_poses_and_depth(
+    seen: list[Seen], tmp_path: Path, name: str
+) -> None:
+    app, write, _ = WRITERS[name]
+    scan = tmp_path / "of a phone" / name
+    write(scan, seen)
+    sources = find_sources([scan])
+    assert list(sources.exports.values()) == [(app, scan)]
+    assert (sources.videos, sources.folders) == ({}, {})
+    for _ in range(2):  # killed, and called again
+        model = read_capture(sources, {}, tmp_path / "work", lambda *_: None)
+    assert model.metric
+    assert all(image.cam_from_world is not None for image in model.images)
+    assert all((image.depth is None) == (app == "record3d") for image in model.images)
+    write_imported(model, tmp_path / "dataset")
+    dataset = read_dataset(tmp_path / "dataset")
+    assert all(dataset.has_file(record) for record in (*dataset.images, *dataset.depth_maps))
+    assert [path.name for path in scan.parent.iterdir()] == [name]  # nothing was written beside it
