@@ -122,7 +122,7 @@ def unused_fields(seen: Sequence[JsonValue] | Sequence[str], used: Sequence[str]
     for each in seen:
         names |= {each} if isinstance(each, str) else {key for key, _ in each.fields()}
     unused = sorted(names - set(used))
-    return [f"{len(unused)} fields are not used: {', '.join(unused)}"] if unused else []
+    return [f"fields that are not used: {', '.join(unused)}"] if unused else []
 
 
 @contextmanager

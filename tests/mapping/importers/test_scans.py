@@ -455,14 +455,14 @@ def test_fields_that_are_not_read_are_named(seen: list[Seen], tmp_path: Path) ->
             continue
         write(tmp_path / name, seen)
         notes = read_model(app, tmp_path / name).notes
-        (note,) = (note for note in notes if "fields are not used: " in note)
+        (note,) = (note for note in notes if "fields that are not used: " in note)
         expected = {
             "strayscanner": "d_y, distortion_center_x, timestamp",
             "polycam": "blur_score",
             "3dscannerapp": "frame_index, motionQuality",
             "record3d": "dh, dw, fps",
         }[app]
-        assert note.endswith(f"fields are not used: {expected}"), (name, notes)
+        assert note.endswith(f"fields that are not used: {expected}"), (name, notes)
 
 
 @pytest.mark.parametrize("name", WRITERS)
