@@ -82,8 +82,8 @@ class CaptureSettings:
         list[Path],
         typer.Argument(
             metavar="SOURCE...",
-            help="Videos (MP4, MOV, WebM), folders of photos and videos, or scans of Polycam, Stray "
-            "Scanner, Record3D and other apps (also transforms.json), all of one place.",
+            help="Videos (MP4, MOV, WebM), folders of photos and videos, or scans of Polycam, "
+            "Record3D, Stray Scanner and others (also transforms.json), all of one place.",
         ),
     ]
     map_id: Annotated[str, typer.Option("--map", help="Id of the map.")]

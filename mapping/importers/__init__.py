@@ -35,19 +35,19 @@ __all__ = [
 
 # name -> module and function (path, folder of photos or None) -> ImportedModel
 IMPORTERS: Mapping[str, tuple[str, str]] = {
-    "3dscannerapp": ("mapping.importers.scans.scanner3d", "read"),
+    "3dscannerapp": ("mapping.importers.scans.apps", "read_3d_scanner_app"),
     "bundler": ("mapping.importers.bundler", "read"),
     "colmap": ("mapping.importers.colmap", "read"),
     "images": ("mapping.importers.images", "read"),
-    "nerfcapture": ("mapping.importers.scans.nerfcapture", "read"),
+    "nerfcapture": ("mapping.importers.scans.apps", "read_nerfcapture"),
     "nerfstudio": ("mapping.importers.nerfstudio", "read"),
     "nvm": ("mapping.importers.nvm", "read"),
     "openmvg": ("mapping.importers.openmvg", "read"),
     "opensfm": ("mapping.importers.opensfm", "read"),
-    "polycam": ("mapping.importers.scans.polycam", "read"),
-    "record3d": ("mapping.importers.scans.record3d", "read"),
+    "polycam": ("mapping.importers.scans.apps", "read_polycam"),
+    "record3d": ("mapping.importers.scans.apps", "read_record3d"),
     "rosbag": ("mapping.importers.rosbag", "read"),
-    "strayscanner": ("mapping.importers.scans.strayscanner", "read"),
+    "strayscanner": ("mapping.importers.scans.apps", "read_stray_scanner"),
 }
 
 

@@ -7,9 +7,9 @@ millimetres without the pixels of low confidence. A frame of a film counts if th
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike, NDArray
 from mapping.importers.dataset import depth_sensor_id
 from mapping.importers.left_out import notes_on
 from mapping.importers.model import ImportedImage, ImportedModel
-from mapping.importers.reading.json_fields import JsonValue
 from mapping.importers.reading.photo_names import photo_size
 from mapping.importers.reading.steps import has_moved
 from mapping.importers.reading.tracks import pose_from_center, rotation_from_matrix
@@ -33,9 +32,7 @@ from visloc.kapture import Sensor
 OURS_FROM_ARKIT = Pose(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
 # A principal point further from the middle, in sides of the picture, belongs to another size.
 _OFF_CENTRE = 0.2
-
-ReadDepth = Callable[[Path, Camera], NDArray[np.float32]]
-"""Returns a depth map (H, W) of a file and the camera that sees it: metres, NaN where unknown."""
+_IN_MILLIMETRES = partial(read_depth, depth_scale=DEFAULT_DEPTH_SCALE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,12 +40,11 @@ class ScanFrame:
     """One photo of a scan.
 
     Attributes:
-        name: below the folder of photos.
-        camera: of the photo.
-        cam_from_world: pose.
+        name: below the folder of photos, where the photo is already.
         depth: file of the depth map, as the app wrote it; it may be missing.
         confidence: file of its confidence, 0 where it is low; it may be missing.
         depth_camera: sees the depth map from the photo's pose, in any size; None for ``camera``.
+        read: returns the depth (H, W) of a file and that camera: metres, NaN where unknown.
     """
 
     name: str
@@ -57,6 +53,7 @@ class ScanFrame:
     depth: Path | None = None
     confidence: Path | None = None
     depth_camera: Camera | None = None
+    read: Callable[[Path, Camera], NDArray[np.float32]] = _IN_MILLIMETRES
 
 
 def arkit_pose(values: ArrayLike, where: str) -> Pose:
@@ -72,14 +69,14 @@ def arkit_pose(values: ArrayLike, where: str) -> Pose:
     return OURS_FROM_ARKIT @ pose_from_center(rotation.T, matrix[:3, 3])
 
 
-def quaternion_pose(xyzw: Sequence[float], center: ArrayLike, where: str) -> Pose:
-    """Return ``cam_from_world`` of the camera's rotation, to the world, and its position there.
+def quaternion_pose(values: Sequence[float], where: str) -> Pose:
+    """Return ``cam_from_world`` of x y z w of the rotation camera to world, and the position.
 
     Raises:
         DatasetError: ``pose.rotation``.
     """
     try:
-        return Pose.from_quaternion([xyzw[3], *xyzw[:3]], center).inverse()
+        return Pose.from_quaternion([values[3], *values[:3]], values[4:]).inverse()
     except InvalidInput as error:
         raise error.about(where, DatasetError) from error
 
@@ -106,7 +103,7 @@ def starts_of_stretches(frames: Sequence[ScanFrame]) -> list[int]:
     for row, frame in enumerate(frames):
         if has_moved(frames[starts[-1]].cam_from_world, frame.cam_from_world):
             starts.append(row)
-    return starts if frames else []
+    return starts
 
 
 def link(file: Path, target: Path) -> None:
@@ -116,52 +113,39 @@ def link(file: Path, target: Path) -> None:
     target.symlink_to(file.resolve())
 
 
-def unused_fields(seen: Sequence[JsonValue] | Sequence[str], used: Sequence[str]) -> list[str]:
-    """Return a note on the fields of objects, or on columns, that are not read."""
-    names: set[str] = set()
-    for each in seen:
-        names |= {each} if isinstance(each, str) else {key for key, _ in each.fields()}
-    unused = sorted(names - set(used))
-    return [f"fields that are not used: {', '.join(unused)}"] if unused else []
+def unused(names: Iterable[str], used: Iterable[str]) -> list[str]:
+    """Return a note on fields that are not read."""
+    others = sorted(set(names) - set(used))
+    return [f"fields that are not used: {', '.join(others)}"] if others else []
 
 
-@contextmanager
-def photos_folder(scan: Path, photos: Path | None) -> Iterator[tuple[Path, list[str]]]:
-    """Have the folder for photos and depth of a scan; a new one is removed on failure.
+def scan_model(
+    read: Callable[[Path, Path], tuple[Sequence[ScanFrame], Sequence[str]]],
+    scan: Path,
+    photos: Path | None,
+) -> ImportedModel:
+    """Make the model of a scan.
 
     Args:
-        photos: the folder; None makes ``<scan>_photos`` beside the scan.
-
-    Yields:
-        The folder, and a note on one that nobody named.
+        read: given the scan and the folder of photos, returns frames as they were taken, and notes.
+        photos: a folder; None makes ``<scan>_photos`` beside the scan, and removes it on failure.
     """
-    scan = scan.resolve()
-    stem = scan.name if scan.is_dir() else scan.stem
-    folder = scan.with_name(f"{stem}_photos") if photos is None else photos
+    whole = scan.resolve()  # "." has no name
+    stem = whole.name if whole.is_dir() else whole.stem
+    folder = whole.with_name(f"{stem}_photos") if photos is None else photos
     is_new = not folder.exists()
     folder.mkdir(exist_ok=True)
     try:
-        yield folder, [f"photos and depth maps are in {folder}"] if photos is None else []
+        frames, notes = read(scan, folder)
+        told = [f"photos and depth maps are in {folder}"] if photos is None else []
+        return _model(frames, folder, [*told, *notes])
     except BaseException:
         if is_new:
             shutil.rmtree(folder, ignore_errors=True)
         raise
 
 
-def scan_model(
-    frames: Sequence[ScanFrame],
-    folder: Path,
-    notes: list[str],
-    read: ReadDepth | None = None,
-    *,
-    metric: bool = True,
-) -> ImportedModel:
-    """Write the depth maps of frames below the folder of photos, and make the model.
-
-    Args:
-        frames: in the order in which they were taken.
-        read: reads depth; None for 16-bit PNGs in millimetres.
-    """
+def _model(frames: Sequence[ScanFrame], folder: Path, notes: Sequence[str]) -> ImportedModel:
     sensors: dict[str, Sensor] = {}
     ids: dict[tuple[Camera, Camera | None], str] = {}
     images = []
@@ -170,11 +154,10 @@ def scan_model(
         depth_camera = depth = None
         try:
             if frame.depth is not None:
-                metres, depth_camera = _depth(frame, read)
+                metres, depth_camera = _depth(frame, frame.depth)
                 depth = f"depth/{rank:06d}.png"
                 _write_depth(folder / depth, metres)
         except VislocError as error:
-            depth_camera = depth = None
             amiss.setdefault(f"depth, {error.message}", []).append(frame.name)
         key = frame.camera, depth_camera
         if key not in ids:
@@ -185,24 +168,19 @@ def scan_model(
                 sensors[of_depth] = Sensor.with_camera(of_depth, depth_camera, "depth")
         pose = frame.cam_from_world
         images.append(ImportedImage(frame.name, ids[key], rank, pose, depth=depth))
-    notes = [*notes, *notes_on(amiss)]
-    return ImportedModel(sensors, tuple(images), folder, metric=metric, notes=tuple(notes))
+    notes = (*notes, *notes_on(amiss))
+    return ImportedModel(sensors, tuple(images), folder, metric=True, notes=notes)
 
 
-def _depth(frame: ScanFrame, read: ReadDepth | None) -> tuple[NDArray[np.float32], Camera]:
+def _depth(frame: ScanFrame, file: Path) -> tuple[NDArray[np.float32], Camera]:
     """Return the depth of a frame in metres, NaN where it is unknown or of low confidence."""
-    assert frame.depth is not None
-    size = photo_size(frame.depth)
+    size, camera = photo_size(file), frame.depth_camera or frame.camera
     if size is None:
         raise refuse("depth.missing")
-    camera = frame.depth_camera or frame.camera
     if size[0] * size[1] > MAX_DEPTH_PIXELS or not camera.has_aspect_of(*size):
         raise refuse("depth.size", got=f"{size[0]} x {size[1]}")
     camera = camera.scaled(*size)
-    if read is None:
-        metres = read_depth(frame.depth, camera, DEFAULT_DEPTH_SCALE)
-    else:
-        metres = read(frame.depth, camera)
+    metres = frame.read(file, camera)
     if frame.confidence is not None and frame.confidence.is_file():
         levels = read_photo_file(frame.confidence).rgb[..., 0]
         if levels.shape != metres.shape:
@@ -214,6 +192,5 @@ def _depth(frame: ScanFrame, read: ReadDepth | None) -> tuple[NDArray[np.float32
 def _write_depth(path: Path, metres: NDArray[np.float32]) -> None:
     units = np.nan_to_num(np.round(metres / DEFAULT_DEPTH_SCALE))
     units[units >= np.iinfo(np.uint16).max] = 0  # further than a depth map can say
-    _, encoded = cv2.imencode(".png", units.astype(np.uint16))
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(encoded.tobytes())
+    path.write_bytes(cv2.imencode(".png", units.astype(np.uint16))[1].tobytes())
