@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from mapping.capture.choosing import ChosenFrames, choose_frames
 from mapping.capture.motion import Motion, measure_motion
-from mapping.films.video import Frame, VideoFacts, frames_of, video_facts
+from mapping.films.video import Frame, VideoFacts, frames_of, video_facts, write_jpeg
 from mapping.progress import ItemProgress
 from mapping.stages.work_folder import WorkFolder, key_of
 from visloc.archive import sha256_of
 from visloc.errors import refuse
 
 _REVISION = 1
-_JPEG_QUALITY = 95
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,19 +86,11 @@ def write_photos(video: FilmedVideo, folder: Path, progress: ItemProgress) -> No
         return
     for frame in frames_of(video.path):
         if (name := missing.pop(frame.seconds, None)) is not None:
-            _write_photo(folder / name, frame)
+            write_jpeg(folder / name, frame.upright_rgb())
             done += 1
             progress(done, len(names))
         if not missing:
             return
-
-
-def _write_photo(path: Path, frame: Frame) -> None:
-    bgr = cv2.cvtColor(frame.upright_rgb(), cv2.COLOR_RGB2BGR)
-    _, encoded = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-    unfinished = path.with_suffix(f".{os.getpid()}.tmp")
-    unfinished.write_bytes(encoded.tobytes())
-    unfinished.replace(path)
 
 
 def _told(path: Path, whole: int, progress: ItemProgress) -> Iterator[Frame]:

@@ -14,7 +14,7 @@ from mapping.films.video import SUFFIXES, is_live_photo, is_video, stems_of_phot
 from mapping.importers import ImportedImage, ImportedModel, read_model
 from mapping.importers.left_out import LeftOut, notes_on
 from mapping.importers.reading.photo_names import natural_order, photo_size
-from mapping.importers.scans.recognition import app_of
+from mapping.importers.scans import app_of
 from mapping.methods.sparse.intrinsics import FROM_EXIF
 from mapping.progress import Progress
 from mapping.stages.work_folder import WorkFolder

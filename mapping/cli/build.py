@@ -26,7 +26,7 @@ from mapping.cli.progress import StageProgress
 from mapping.cluster.stage_timings import Costs
 from mapping.cluster.storage import is_map_folder, is_remote, open_store, scratch_folder
 from mapping.importers import IMPORTERS, MASKS, ImportSummary, import_dataset, imported
-from mapping.importers.scans.recognition import refuse_scan
+from mapping.importers.scans import refuse_scan
 from mapping.methods.rgbd import DepthSettings
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.options import (

@@ -31,6 +31,8 @@ from visloc.images import ImageLimits
 from visloc.photo_formats import SUFFIXES as PHOTO_SUFFIXES
 
 SUFFIXES = (".mp4", ".m4v", ".mov", ".webm", ".mkv", ".3gp", ".3g2")
+SHARPNESS_SIDE = 960  # of the longer side: motion blur of a pixel or two is visible at this size
+_JPEG_QUALITY = 95
 # Demuxers by kind of file (visloc.file_kinds).
 _DEMUXERS = {"MP4": "mov", "3GP": "mov", "MOV": "mov", "Matroska or WebM": "matroska"}
 _MAX_PIXELS = ImageLimits().max_pixels
@@ -129,6 +131,20 @@ class Frame:
     def upright_rgb(self) -> NDArray[np.uint8]:
         """(H, W, 3) as ``rgb``, upright."""
         return np.ascontiguousarray(np.rot90(self.rgb(), self.quarter_turns))
+
+
+def sharpness(grey: NDArray[np.uint8]) -> float:
+    """Return the variance of the Laplacian of grey levels (h, w), comparable among near frames."""
+    return float(cv2.Laplacian(cv2.GaussianBlur(grey, (3, 3), 0), cv2.CV_32F).var())
+
+
+def write_jpeg(path: Path, rgb: NDArray[np.uint8]) -> None:
+    """Write a picture, whole or not at all."""
+    bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
+    _, encoded = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    unfinished = path.with_suffix(f".{os.getpid()}.tmp")
+    unfinished.write_bytes(encoded.tobytes())
+    unfinished.replace(path)
 
 
 def is_video(path: Path) -> bool:

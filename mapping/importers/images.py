@@ -19,7 +19,7 @@ from mapping.films.video import is_live_photo, stems_of_photos
 from mapping.importers.left_out import notes_on
 from mapping.importers.model import ImportedImage, ImportedModel
 from mapping.importers.reading.photo_names import natural_order
-from mapping.importers.scans.recognition import refuse_scan
+from mapping.importers.scans import refuse_scan
 from mapping.methods.sparse.intrinsics import FROM_EXIF
 from visloc.errors import InvalidInput, NotFound, TooLarge, VislocError, refuse
 from visloc.file_kinds import kind_of

@@ -1,4 +1,4 @@
-"""Measurements of points in photos, and checks against where the points project."""
+"""Measurements of points in photos, checks against where the points project, and poses."""
 
 from __future__ import annotations
 
@@ -11,9 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from mapping.importers.model import ImportedImage, ImportedModel
 from visloc.errors import refuse
-from visloc.geometry import Pose
+from visloc.geometry import Pose, rotation_angle
 from visloc.kapture import Sensor
 from visloc.pose.colmap import project
+
+# A frame of a film counts when the camera has moved so far since the last one.
+_STEP_M, _TURN_RAD = 0.25, np.radians(10.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -136,3 +139,9 @@ def rotation_from_matrix(values: ArrayLike) -> NDArray[np.float64] | None:
 def pose_from_center(rotation: NDArray[np.float64], center: NDArray[np.float64]) -> Pose:
     """Make ``cam_from_world`` of a rotation (3, 3) and the camera's position in the world (3,)."""
     return Pose(rotation, -rotation @ center)
+
+
+def has_moved(before: Pose, after: Pose) -> bool:
+    """Tell whether two ``cam_from_world`` in a world in metres are far enough apart to use both."""
+    moved = float(np.linalg.norm(before.center - after.center))
+    return moved >= _STEP_M or rotation_angle(before.rotation @ after.rotation.T) >= _TURN_RAD

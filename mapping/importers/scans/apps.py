@@ -20,15 +20,12 @@ from functools import partial
 from io import BytesIO
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from mapping.films.sharpness import SHARPNESS_SIDE, sharpness
-from mapping.films.video import Frame, frames_of, video_facts
+from mapping.films.video import SHARPNESS_SIDE, Frame, frames_of, sharpness, video_facts, write_jpeg
 from mapping.importers import nerfstudio
-from mapping.importers.model import ImportedModel
 from mapping.importers.reading.json_fields import JsonValue, parse_json, read_json
 from mapping.importers.reading.photo_names import natural_order, photo_names, photo_size
 from mapping.importers.reading.text_lines import TextLines
@@ -50,7 +47,6 @@ from visloc.images import FILE_LIMITS
 from visloc.photo_formats import MALFORMED, png_samples
 
 _INTRINSICS, _SIZE = ("fx", "fy", "cx", "cy"), ("width", "height")
-_JPEG_QUALITY = 95
 
 _3D_POSE, _3D_INTRINSICS = "cameraPoseARFrame", "intrinsics"
 
@@ -68,31 +64,6 @@ _STRAY_FRAME, _STRAY_POSE = "frame", ("qx", "qy", "qz", "qw", "x", "y", "z")
 _STRAY_MOST_FRAMES = 10**6
 
 Frames = tuple[Sequence[ScanFrame], Sequence[str]]
-
-
-def read_3d_scanner_app(path: Path, photos: Path | None = None) -> ImportedModel:
-    """Read a folder; most of its frames have no photo and are left out."""
-    return scan_model(_of_3d_scanner_app, path, photos)
-
-
-def read_nerfcapture(path: Path, photos: Path | None = None) -> ImportedModel:
-    """Read the folder of a ``transforms.json`` whose frames have ``depth_path``."""
-    return scan_model(_of_nerfcapture, path, photos)
-
-
-def read_polycam(path: Path, photos: Path | None = None) -> ImportedModel:
-    """Read the folder of a capture, or its ``keyframes``; corrected images and cameras go first."""
-    return scan_model(_of_polycam, path, photos)
-
-
-def read_record3d(path: Path, photos: Path | None = None) -> ImportedModel:
-    """Read an ``.r3d`` file or a folder; depth is left out."""
-    return scan_model(_of_record3d, path, photos)
-
-
-def read_stray_scanner(path: Path, photos: Path | None = None) -> ImportedModel:
-    """Read a folder; where the camera has moved, the sharpest frame of the film is a photo."""
-    return scan_model(_of_stray_scanner, path, photos)
 
 
 def _of_3d_scanner_app(path: Path, folder: Path) -> Frames:
@@ -317,7 +288,8 @@ def _stray_photos(film: Path, recorded: Sequence[ScanFrame], folder: Path) -> It
         if row >= len(recorded):
             break
         if row in starts and best is not None:
-            yield _stray_photo(best[1], best[2], folder)
+            write_jpeg(folder / best[1].name, best[2].rgb())
+            yield best[1]
             best = None
         sharp = sharpness(frame.grey(SHARPNESS_SIDE))
         if best is None or sharp > best[0]:
@@ -325,11 +297,13 @@ def _stray_photos(film: Path, recorded: Sequence[ScanFrame], folder: Path) -> It
     if row + 1 != len(recorded) or best is None:
         expected, got = f"{len(recorded)} frames", f"{row + 1} or more"
         raise refuse("import.scan_frames", field=str(film), expected=expected, got=got)
-    yield _stray_photo(best[1], best[2], folder)
+    write_jpeg(folder / best[1].name, best[2].rgb())
+    yield best[1]
 
 
-def _stray_photo(recorded: ScanFrame, frame: Frame, folder: Path) -> ScanFrame:
-    bgr = cv2.cvtColor(frame.rgb(), cv2.COLOR_RGB2BGR)
-    _, encoded = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-    (folder / recorded.name).write_bytes(encoded.tobytes())
-    return recorded
+# Of a film, frames where the camera has moved are used.
+read_3d_scanner_app = partial(scan_model, _of_3d_scanner_app)
+read_nerfcapture = partial(scan_model, _of_nerfcapture)
+read_polycam = partial(scan_model, _of_polycam)
+read_record3d = partial(scan_model, _of_record3d)
+read_stray_scanner = partial(scan_model, _of_stray_scanner)

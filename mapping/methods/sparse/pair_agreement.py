@@ -73,8 +73,9 @@ def doubts_about_poses(
         return ()
     message = (
         f"{len(found)} of {compared} pairs of photos that match contradict the poses of the map: "
-        "something large that moves, such as people, vehicles or a screen, may have bent it; "
-        "film again without it, or give masks of it"
+        "something large that moves, such as people, vehicles or a screen, may have bent it, or "
+        "photos of several lenses or zooms that share a camera; film again without it, or give "
+        "masks of it"
     )
     involved = Counter(row for pair in found for row in (pair.first, pair.second))
     names = [photos[row].name for row, _ in involved.most_common(_MAX_NAMES)]

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from mapping.capture.sources import find_sources, read_capture
 from mapping.cli.main import app as mapping_app
 from mapping.importers import import_dataset, read_model, write_imported
-from mapping.importers.scans.recognition import app_of
+from mapping.importers.scans import app_of
 from mapping.stages.depth import read_depth
 from samples.film import encode_video
 from tests.mapping.capture.test_video import turned
