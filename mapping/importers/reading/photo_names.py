@@ -29,7 +29,8 @@ def photo_names(
 
     A relative name stays when there is such a photo. Else, what it means from ``base`` counts: if
     that lies in ``photos``, the part below it is the name. An absolute name or one that climbs out
-    with ``..`` is shortened to its last part where that is not so; any other stays.
+    with ``..`` is shortened where that is not so: to its longest end that is such a photo, or else
+    to its last part. Any other stays.
 
     Args:
         raw: each photo's name and where it stands.
@@ -62,7 +63,7 @@ def photo_names(
     if not shortened:
         return names, ()
     return names, (
-        f"{len(shortened)} photo names lead out of the folder of photos; their last part was "
+        f"{len(shortened)} photo names lead out of the folder of photos; their end was "
         f"taken: {', '.join(shortened[:3])}" + (", ..." if len(shortened) > 3 else ""),
     )
 
@@ -77,7 +78,10 @@ def _relative(text: str, base: Path, photos: Path, folder: str) -> tuple[str, bo
     is_inside = full.is_relative_to(folder) and full != PurePosixPath(folder)
     if is_inside and (leads_out or (not _is_file(photos / plain) and _is_file(Path(full)))):
         return full.relative_to(folder).as_posix(), False
-    return (full.name, True) if leads_out else (plain, False)
+    if not leads_out:
+        return plain, False
+    ends = ("/".join(full.parts[start:]) for start in range(1, len(full.parts)))
+    return next((end for end in ends if _is_file(photos / end)), full.name), True
 
 
 def natural_order(name: str) -> tuple[tuple[int, str], ...]:

@@ -13,7 +13,7 @@ _APPS: Mapping[str, tuple[tuple[str, ...], tuple[bytes, ...]]] = {
     "3dscannerapp": (("frame_*.json",), (b'"cameraPoseARFrame"',)),
     "nerfcapture": (("transforms.json",), (b'"depth_path"',)),
     "polycam": ((*_CAMERAS, *(f"keyframes/{each}" for each in _CAMERAS)), (b'"t_00"', b'"fx"')),
-    "record3d": (("metadata", "metadata.json"), (b'"poses"', b'"K"')),
+    "record3d": (("metadata", "metadata.json", "EXR_RGBD/metadata.json"), (b'"poses"', b'"K"')),
     "strayscanner": (("odometry.csv",), (b"frame", b"qx")),
 }
 _LONGEST = 2**26  # bytes that are looked through

@@ -12,6 +12,7 @@ photos as stored. Depth is in millimetres.
 
 from __future__ import annotations
 
+import re
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -56,7 +57,8 @@ _RGBA, _FARTHEST_M, _LEAST_KNOWN = (8, 6), 100.0, 0.5  # bits and colour type of
 _POLYCAM_POSE = tuple(f"t_{row}{column}" for row in range(3) for column in range(4))
 
 _R3D_FIELDS = ("K", "w", "h", "poses", "perFrameIntrinsicCoeffs")
-_R3D_PHOTOS = ("rgbd/{}.jpg", "rgb/{}.jpg", "rgb/{}.png")
+_R3D_PHOTOS = ("rgbd", "rgb")  # folders
+_NUMBER = re.compile(r"[0-9]{1,9}")
 # What zipfile raises on damaged files; those that are encrypted are a RuntimeError.
 _DAMAGED_ZIP = (zipfile.BadZipFile, RuntimeError, ValueError, EOFError, zlib.error)
 
@@ -139,7 +141,8 @@ def _nerf_metres(file: Path, camera: Camera, unit: float | None) -> NDArray[np.f
 
 def _of_polycam(path: Path, folder: Path) -> Frames:
     scan = path / "keyframes" if (path / "keyframes").is_dir() else path
-    kind = "corrected_" if (scan / "corrected_cameras").is_dir() else ""
+    corrected = (scan / "corrected_images", scan / "corrected_cameras")
+    kind = "corrected_" if all(each.is_dir() for each in corrected) else ""
     files = sorted((scan / f"{kind}images").glob("*.jpg"), key=lambda f: natural_order(f.name))
     frames, fields = [], set[str]()
     for photo in files:
@@ -178,6 +181,7 @@ def _polycam_camera(top: JsonValue) -> Camera:
 
 def _of_record3d(path: Path, folder: Path) -> Frames:
     if path.is_dir():
+        path = path / "EXR_RGBD" if (path / "EXR_RGBD").is_dir() else path
         return _of_record3d_files(path, path, folder)
     try:
         with zipfile.ZipFile(path) as archive:
@@ -194,16 +198,22 @@ def _of_record3d_files(path: Path, scan: Path | zipfile.Path, folder: Path) -> F
     if not (scan / name).is_file():
         raise refuse("import.missing", field=str(path / name))
     top = parse_json((scan / name).read_bytes(), path / name)
+    photos = {
+        int(file.stem): file
+        for place in _R3D_PHOTOS
+        if (scan / place).is_dir()
+        for file in (scan / place).iterdir()
+        if file.suffix in (".jpg", ".png") and _NUMBER.fullmatch(file.stem)
+    }
     poses = top["poses"].elements()
     recorded, files = [], []
     for row, values in enumerate(poses):
-        file = next((f for p in _R3D_PHOTOS if (f := scan / p.format(row)).is_file()), None)
-        if file is not None:
+        if row in photos:
             pose = OURS_FROM_ARKIT @ quaternion_pose(values.numbers(7), values.where)
             recorded.append(ScanFrame(f"{row:06d}.jpg", _record3d_camera(top, row), pose))
-            files.append(file)
+            files.append(photos[row])
     if not recorded:
-        raise refuse("import.empty", field=str(path), expected=_R3D_PHOTOS[0].format(0))
+        raise refuse("import.empty", field=str(path), expected="photos such as rgbd/0.jpg")
     frames = []
     for start in starts_of_stretches(recorded):
         frame, file = recorded[start], files[start]

@@ -132,7 +132,11 @@ def test_names_of_windows_are_paths_below_the_photos(
     monkeypatch.setattr("tests.mapping.importers.test_colmap.IMAGES", images)
     model = read(write(tmp_path / "model"))
     assert {image.name for image in model.images} == {"two.jpg", "a/0.jpg", "a/one.jpg"}
-    assert any(r"their last part was taken: C:\scan\two.jpg" in note for note in model.notes)
+    assert any(r"their end was taken: C:\scan\two.jpg" in note for note in model.notes)
+    (tmp_path / "images" / "scan").mkdir(parents=True)
+    (tmp_path / "images" / "scan" / "two.jpg").touch()  # the folder was moved as a whole
+    model = read(tmp_path / "model", tmp_path / "images")
+    assert {image.name for image in model.images} == {"scan/two.jpg", "a/0.jpg", "a/one.jpg"}
 
 
 def test_ranks_count_numbers_in_names_as_numbers(tmp_path: Path) -> None:

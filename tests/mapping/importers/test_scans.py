@@ -288,6 +288,15 @@ def test_of_each_stretch_of_a_film_the_sharpest_frame_is_used(
     assert any("4 of 12 frames are used" in note for note in model.notes)
 
 
+def test_an_export_of_record3d_is_read_too(seen: list[Seen], tmp_path: Path) -> None:
+    for name, content in record3d_files(seen).items():
+        name = name.replace("rgbd/", "rgb/").replace("metadata", "metadata.json")
+        put(tmp_path / "scan" / "EXR_RGBD" / name.replace("rgb/", "rgb/000"), content)
+    assert app_of(tmp_path / "scan") == app_of(tmp_path / "scan" / "EXR_RGBD") == "record3d"
+    model = read_model("record3d", tmp_path / "scan")
+    assert [image.name for image in model.images] == [f"{row:06d}.jpg" for row in (0, 2, 4, 6)]
+
+
 @pytest.mark.parametrize("columns", [9, 13])
 def test_older_recordings_tell_one_camera_for_all_frames(
     seen: list[Seen], tmp_path: Path, columns: int
