@@ -232,7 +232,7 @@ def sequence(places: Places, _: Path) -> Iterator[Row]:
             look = localizer.look(read_photo_file(source), sent, LocalizeOptions())
             seen = SeenInstant(second, (SeenImage.alone(look),), None, NO_PRIORS)
             answers += solver.add(seen)
-        for answer, (_, _, truth) in zip(answers + solver.finish(), _queries(places), strict=True):
+        for answer, (*_, truth) in zip(answers + solver.finish(), _queries(places), strict=True):
             together.asked += 1
             if answer.pose is not None:
                 together.add(answer.pose.rig_from_world, answer.pose.covariance, truth)
@@ -376,7 +376,8 @@ def zoomed_maps(places: Places, scratch: Path) -> Iterator[str]:
         folder.mkdir(parents=True)
         zoomed = set()
         for number, record in enumerate(left[:: max(len(left) // count, 1)][:count]):
-            photo, new = Image.open(dataset.path_of(record)), record.path.replace("/", "_")
+            photo: Image.Image = Image.open(dataset.path_of(record))
+            new = record.path.replace("/", "_")
             tags: dict[str, float] = {"FocalLengthIn35mmFilm": 25}
             if number % 10 == 5:
                 zoomed.add(new)
