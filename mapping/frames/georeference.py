@@ -359,7 +359,7 @@ def _read_rows(path: Path) -> list[tuple[int, Mapping[str, str | float]]]:
             raise bad(
                 1, "the file is too large", f"at most {_MAX_FILE_BYTES} bytes", path.stat().st_size
             )
-        lines = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
+        lines = list(csv.reader(path.read_text(encoding="utf-8-sig").split("\n")))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise bad(1, "the file cannot be read", "a CSV file", str(error)) from None
     header = tuple(name.strip() for name in lines[0]) if lines else ()

@@ -28,7 +28,7 @@ def read_poses(path: Path, refs: Sequence[str]) -> list[tuple[str, Similarity]]:
         InvalidInput: ``set.poses`` with the line, and what ``Pose.from_quaternion`` raises.
     """
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise refuse(
             "set.poses", "the file cannot be read", field=str(path), expected="a text file"

@@ -149,7 +149,10 @@ def read(
     if gnss:
         sensors[_GNSS] = Sensor(_GNSS, "EXIF", "gnss", ("EPSG:4326",), None)
     if unknown := sum(photo.focal_length_px is None for photo in found):
-        notes.append(f"{unknown} of {len(found)} photos do not tell their focal length")
+        notes.append(
+            f"{unknown} of {len(found)} photos do not tell their focal length: those of one camera "
+            "and size count as not zoomed"
+        )
     return ImportedModel(
         sensors=sensors,
         images=tuple(

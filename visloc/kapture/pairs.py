@@ -48,11 +48,7 @@ def read_pair_rows(path: Path) -> Iterator[PairRow]:
 
 
 def check_pair_names(path: Path, names: Iterable[str]) -> None:
-    """Refuse names of photos that a pairs file cannot hold.
-
-    Raises:
-        DatasetError: ``kapture.field`` for a name with a comma, or that would not be read as it is.
-    """
+    """Refuse names of photos that a pairs file cannot hold, such as those with a comma."""
     for name in names:
         if not is_field(name):
             raise refuse("kapture.field", field=str(path), got=name)
@@ -61,10 +57,8 @@ def check_pair_names(path: Path, names: Iterable[str]) -> None:
 def write_pair_rows(path: Path, rows: Iterable[tuple[str, str, float]]) -> None:
     """Write pairs as kapture has them, scores exactly; a file there is replaced.
 
-    A name that begins with ``#``, as comments do, is written as ``./#``.
-
-    Raises:
-        DatasetError: ``kapture.field`` for a name with a comma, or that would not be read as it is.
+    A name that begins with ``#``, as comments do, is written as ``./#``. One that would not be read
+    as it is, such as one with a comma, is refused.
     """
     lines = [_HEADER]
     for first, second, score in rows:

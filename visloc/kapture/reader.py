@@ -27,7 +27,8 @@ from visloc.kapture.rigs import unroll_rigs
 from visloc.kapture.table import Table
 
 _NEWEST_VERSION = (1, 1)
-_SAME = 1e-4  # relative, and in radians: of the numbers of a pose, four digits agree
+# Two poses of a photo agree to this share of the size of the place, and to as many radians.
+_SAME, _ROUNDING = 1e-4, 1e-9
 _TABLES = {
     *("sensors.txt", "rigs.txt", "trajectories.txt", "records_camera.txt", "records_depth.txt"),
     *("records_gnss.txt", *OTHER_FILES),
@@ -64,22 +65,26 @@ def read_dataset(root: Path, files: RecordFiles | None = None) -> Dataset:
 
 def _notes_on_rigs(dataset: Dataset) -> list[str]:
     """Name the photos whose own pose is not the one that their rig tells."""
-    off = []
-    for record in dataset.images:
-        own = dataset.trajectories.get((record.timestamp, record.sensor_id))
-        told = None if own is None else dataset.pose_by_rig(record)
-        if own is not None and told is not None:
-            far = float(np.linalg.norm(own.center - told.center))
-            if far > _SAME * np.abs(own.center).max() or (
-                rotation_angle(own.rotation @ told.rotation.T) > _SAME
-            ):
-                off.append((far, record.path))
-    if not off:
+    twice = [
+        (record.path, own, told)
+        for record in dataset.images
+        if (own := dataset.trajectories.get((record.timestamp, record.sensor_id))) is not None
+        and (told := dataset.pose_by_rig(record)) is not None
+    ]
+    if not twice:
         return []
-    far, path = max(off)
+    centers = np.array([(own.center, told.center) for _, own, told in twice])
+    far = np.linalg.norm(centers[:, 0] - centers[:, 1], axis=1)
+    turned = [rotation_angle(own.rotation @ told.rotation.T) for _, own, told in twice]
+    off = (far > _SAME * np.ptp(centers, axis=(0, 1)).max() + _ROUNDING) | (
+        np.array(turned) > _SAME
+    )
+    if not off.any():
+        return []
+    worst = int(np.argmax(far * off))
     return [
-        f"{len(off)} photos have a pose of their own that contradicts that of their rig, which was "
-        f"not used: {path} is {far:.3g} units from there"
+        f"{off.sum()} photos have a pose of their own that contradicts that of their rig, which "
+        f"was not used: {twice[worst][0]} is {far[worst]:.3g} units from there"
     ]
 
 

@@ -78,7 +78,10 @@ def test_photos_of_one_camera_share_a_sensor_with_the_focal_length_of_exif(tmp_p
     unknown = model.sensors["camera2"]
     assert unknown.camera is None
     assert unknown.image_size == (64, 48)
-    assert model.notes == ("1 of 4 photos do not tell their focal length",)
+    assert model.notes == (
+        "1 of 4 photos do not tell their focal length: those of one camera and size count as not "
+        "zoomed",
+    )
 
 
 def test_photos_of_a_phone_in_all_orientations_share_a_camera(tmp_path: Path) -> None:

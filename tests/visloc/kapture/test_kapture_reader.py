@@ -552,8 +552,9 @@ def test_poses_of_photos_that_contradict_their_rig_are_named(
     files = {
         "sensors": sensors,
         "rigs": "rig, cam, 1, 0, 0, 0, 1, 0, 0",
-        "records_camera": "1, cam, a.jpg",
-        "trajectories": f"1, rig, 1, 0, 0, 0, 0, 2, 3\n{own}\n",
+        "records_camera": "1, cam, a.jpg\n2, cam, b.jpg",
+        "trajectories": f"1, rig, 1, 0, 0, 0, 0, 2, 3\n2, rig, 1, 0, 0, 0, 4, 0, 0\n"
+        f"2, cam, 1, 0, 0, 0, 5, 0, 0\n{own}\n",
     }
     notes = [note for note in read_dataset(write(tmp_path, files)).notes if "rig" in note]
     assert len(notes) == (far is not None)
