@@ -105,11 +105,8 @@ def _link_masks(images: Iterable[ImportedImage], photos: Path, folder: Path) -> 
     for image in images:
         if image.mask is not None:
             link = folder / f"{image.name}.png"
-            try:
-                link.parent.mkdir(parents=True, exist_ok=True)
-                link.symlink_to(photos / image.mask)
-            except OSError as error:  # a name that is too long with the suffix
-                raise refuse("import.name", field=f"mask of {image.name!r}", got=link) from error
+            link.parent.mkdir(parents=True, exist_ok=True)
+            link.symlink_to(photos / image.mask)
 
 
 def _sorted(records: Iterable[FileRecord]) -> tuple[FileRecord, ...]:

@@ -35,7 +35,6 @@ _OURS_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _UNITS = ("depth_unit_scale_factor", "integer_depth_scale")  # nerfstudio's key, instant-ngp's
-_DEGREE = math.pi / 180
 _SAME_FOCAL = 0.01  # relative; angles and sizes are written with few digits
 _NAMED = 3
 
@@ -207,14 +206,14 @@ def _camera(top: JsonValue, frame: JsonValue, name: str, folder: Path, seen: _Se
     def focal_length(axis: str, side: int) -> float | None:
         """Return what the file gives for an axis: pixels, or an angle over a side of the photo."""
         given = number(f"fl_{axis}")
-        angles = ((f"camera_angle_{axis}", "radians", 1.0), (f"{axis}_fov", "degrees", _DEGREE))
-        for key, unit, radians in angles:
-            angle = find(key)
-            if angle is None:
+        for key, in_radians in ((f"camera_angle_{axis}", float), (f"{axis}_fov", math.radians)):
+            value = find(key)
+            if value is None:
                 continue
-            if not 0 < angle.number() * radians < math.pi:
-                raise angle.error("the angle is not valid", expected=f"above 0 {unit}, below pi")
-            other = 0.5 * side / math.tan(0.5 * angle.number() * radians)
+            angle = in_radians(value.number())
+            if not 0 < angle < math.pi:
+                raise value.error("the angle is not valid", expected="more than 0, less than pi")
+            other = 0.5 * side / math.tan(0.5 * angle)
             given = other if given is None else given
             if abs(other - given) > _SAME_FOCAL * given:
                 seen.leave_out(f"{key} contradict the focal length that was taken", name)
