@@ -270,7 +270,7 @@ def _check_images_text(
                 raise _bad(
                     lines,
                     "the keypoints are not valid",
-                    "x, y, point id of each",
+                    "x, y, point id of each; a blank line for none",
                     f"{len(keypoints)} fields",
                 )
             images[image] = len(keypoints) // 3

@@ -352,6 +352,8 @@ def _fixes(
         f"{len(located)} of {len(shots)} photos have a GPS position, {off:.2g} m (median, "
         "horizontally) from where they were reconstructed"
     ]
+    if reference.parent is None:  # a file of its own
+        notes += notes_on_unread(reference)
     if np.abs(geodetic[:, 2] - _UNUSED_ALTITUDE).max() < 0.01:
         notes.append("the altitudes of the GPS positions are OpenSfM's placeholder, not measured")
     # Horizontally: altitudes are worse, or not measured.

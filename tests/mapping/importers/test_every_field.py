@@ -295,6 +295,15 @@ def test_each_field_of_a_line_is_used_refused_or_counted(tmp_path: Path, name: s
     assert silent == []
 
 
+def test_the_reference_of_opensfm_may_be_a_file_of_its_own(tmp_path: Path) -> None:
+    (top,) = opensfm(tmp_path)
+    reference = top.pop("reference_lla") | {"unknown_field": 7}
+    (tmp_path / "reconstruction.json").write_text(json.dumps([top]))
+    (tmp_path / "reference_lla.json").write_text(json.dumps(reference))
+    notes = read_model("opensfm", tmp_path).notes
+    assert "reference_lla.json has fields that are not read: unknown_field (1)" in notes
+
+
 def test_each_array_of_hloc_is_used_refused_or_counted(tmp_path: Path) -> None:
     groups: dict[str, dict[str, Any]] = {
         "a.jpg": {"keypoints": np.ones((3, 2)), "descriptors": np.eye(4)[:, :3]},
