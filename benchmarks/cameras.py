@@ -232,10 +232,10 @@ def sequence(places: Places, _: Path) -> Iterator[Row]:
             look = localizer.look(read_photo_file(source), sent, LocalizeOptions())
             seen = SeenInstant(second, (SeenImage.alone(look),), None, NO_PRIORS)
             answers += solver.add(seen)
-        for answer, (*_, truth) in zip(answers + solver.finish(), _queries(places), strict=True):
+        for answer, query in zip(answers + solver.finish(), _queries(places), strict=True):
             together.asked += 1
             if answer.pose is not None:
-                together.add(answer.pose.rig_from_world, answer.pose.covariance, truth)
+                together.add(answer.pose.rig_from_world, answer.pose.covariance, query[2])
         yield from (alone, together)
 
 
