@@ -174,6 +174,7 @@ def _make_engine(settings: ServiceSettings, store: MapStore, observer: Observer)
         max_upload_bytes=settings.max_upload_bytes,
         limit_s=settings.request_timeout_s,
         metrics=observer.metrics,
+        on_overdue=observer.worker_ended,
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import AsyncGenerator, AsyncIterator, Iterator, Mapping, Sequence
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterator, Mapping, Sequence
 from contextlib import aclosing, contextmanager
 from dataclasses import dataclass
 
@@ -16,7 +16,6 @@ from service.engine.set_sequences import SetSequence
 from service.engine.sets import SetSearch, answers_of, parted
 from service.engine.uploads import Uploads
 from service.errors import stopping_error
-from service.telemetry.logs import current_request
 from service.telemetry.metrics import Metrics
 from service.values import (
     InstantJob,
@@ -66,6 +65,7 @@ class Engine:
         max_upload_bytes: largest packed map.
         limit_s: longest time of one task of a worker.
         metrics: count events of maps and workers.
+        on_overdue: see ``Workers``.
     """
 
     def __init__(
@@ -79,6 +79,7 @@ class Engine:
         max_upload_bytes: int = 2**34,
         limit_s: float = 60.0,
         metrics: Metrics,
+        on_overdue: Callable[[], None] = lambda: None,
     ) -> None:
         self._store = store
         self._metrics = metrics
@@ -88,7 +89,7 @@ class Engine:
             limit_s=limit_s,
             warm=lambda: self._catalog.known,
             on_death=metrics.observe_worker_death,
-            on_overdue=self._note_overdue,
+            on_overdue=on_overdue,
         )
         self._catalog = Catalog(store, self.workers)
         self.scenes = Scenes(self._catalog)
@@ -342,10 +343,6 @@ class Engine:
         """
         with self._noted("delete"):
             await self._catalog.delete(map_id, version, self._limit_s)
-
-    def _note_overdue(self) -> None:
-        request = current_request()
-        self._metrics.observe_worker_ended(None if request is None else request.key)
 
     @contextmanager
     def _noted(self, change: str) -> Iterator[None]:

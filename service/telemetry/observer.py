@@ -104,6 +104,11 @@ class Observer:
             record.failed = statuses_of(error)[0] >= 500
             self.metrics.observe_error(record.door, error)
 
+    def worker_ended(self) -> None:
+        """Count a worker process that was ended because of the current request."""
+        record = current_request()
+        self.metrics.observe_worker_ended(None if record is None else record.key)
+
     def localization(self, found: Localization) -> None:
         """Note the answer to a photo."""
         self._answer(found)

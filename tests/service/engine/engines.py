@@ -14,6 +14,7 @@ from typing import Any, Protocol, TypeVar
 
 from service.engine.engine import Engine
 from service.telemetry.metrics import Metrics
+from service.telemetry.observer import Observer
 from service.values import RigJob, WorkerSettings, photo_job
 from service.workers.tasks import Vision
 from visloc.archive import MapStore
@@ -44,7 +45,14 @@ def make(
         max_image_bytes=limits.max_bytes,
         max_image_pixels=limits.max_pixels,
     )
-    return Engine(MapStore(maps_dir), of_workers, metrics=Metrics(), **settings)
+    observer = Observer(Metrics(), None)
+    return Engine(
+        MapStore(maps_dir),
+        of_workers,
+        metrics=observer.metrics,
+        on_overdue=observer.worker_ended,
+        **settings,
+    )
 
 
 async def until(happened: Callable[[], bool], seconds: float = 20.0) -> None:
