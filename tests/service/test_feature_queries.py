@@ -341,8 +341,12 @@ def test_what_is_not_json_is_refused(doors: Any) -> None:
     files = {"features": ("f.json", b"\x93NUMPY\x01\x00")}
     problem = doors.http.post("/localize", data={"map": "room"}, files=files).json()
     assert (problem["code"], problem["field"]) == ("request.malformed", "features")
-    text = doors.http.post("/localize", data={"map": "room", "features": "{}"}, files={"a": b""})
-    assert text.json()["expected"] == "a file, as of curl -F features=@photo.json"
+
+
+def test_features_in_a_form_need_no_file_name(doors: Any) -> None:
+    parts = {"map": (None, "room"), "features": (None, "{}")}
+    problem = doors.http.post("/localize", files=parts).json()
+    assert (problem["code"], problem["field"]) == ("request.missing_field", "features.kind")
 
 
 def test_a_request_has_a_photo_or_features(
