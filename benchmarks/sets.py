@@ -138,7 +138,7 @@ def main(
         max_image_bytes=limits.max_bytes,
         max_image_pixels=limits.max_pixels,
     )
-    engine = Engine(store, settings, workers=workers, metrics=Metrics())
+    engine = Engine(store, settings, workers=workers, metrics=Metrics(), on_overdue=lambda: None)
     typer.echo(
         "| queries of | photos | localized by the own map | in the set: right tile | wrong tile "
         "| ambiguous | refused | others localized | p50 own map, ms | p50 set, ms | ratio |\n"

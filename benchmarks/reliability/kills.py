@@ -73,7 +73,7 @@ async def kill_workers(maps: SampleMaps, work: Path, kills: int) -> list[Check]:
         ),
         _retry_check(done, expected),
         Check(
-            "another takes its place, maps open and warm, within 10 s",
+            "another takes its place within 10 s",
             f"at most {max(replaced):.1f} s",
             max(replaced) < BACK_WITHIN_S,
             is_speed=True,
@@ -139,7 +139,7 @@ async def kill_service(maps: SampleMaps, work: Path, kills: int) -> list[Check]:
 
 
 async def _kill_a_worker(service: ServiceProcess, number: int) -> float:
-    """Kill the next worker; the seconds until another has the maps open and takes requests."""
+    """Kill the next worker; the seconds until another takes requests."""
     await asyncio.sleep(2)
     before = sorted(service.worker_pids)
     os.kill(before[number % len(before)], signal.SIGKILL)

@@ -87,7 +87,7 @@ def ask_floors(
         max_image_bytes=limits.max_bytes,
         max_image_pixels=limits.max_pixels,
     )
-    engine = Engine(store, settings, metrics=Metrics())
+    engine = Engine(store, settings, metrics=Metrics(), on_overdue=lambda: None)
     for outcome in asyncio.run(_ask_engine(engine, queries)):
         if outcome.accepted and outcome.tile is not None:
             yield replace(outcome, right=floor_of(outcome.tile) == floor_of(outcome.photo))

@@ -65,7 +65,7 @@ class Engine:
         max_upload_bytes: largest packed map.
         limit_s: longest time of one task of a worker.
         metrics: count events of maps and workers.
-        on_overdue: see ``Workers``.
+        on_overdue: as of ``Workers``.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class Engine:
         max_upload_bytes: int = 2**34,
         limit_s: float = 60.0,
         metrics: Metrics,
-        on_overdue: Callable[[], None] = lambda: None,
+        on_overdue: Callable[[], None],
     ) -> None:
         self._store = store
         self._metrics = metrics

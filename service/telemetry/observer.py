@@ -105,7 +105,7 @@ class Observer:
             self.metrics.observe_error(record.door, error)
 
     def worker_ended(self) -> None:
-        """Count a worker process that was ended because of the current request."""
+        """Note a worker process that was ended because of the current request."""
         record = current_request()
         self.metrics.observe_worker_ended(None if record is None else record.key)
 

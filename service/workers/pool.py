@@ -335,7 +335,7 @@ class Workers:
             return None
 
     def _note_overdue(self, pid: int) -> None:
-        logger.warning("worker process %s was ended: nobody waited for its task any more", pid)
+        logger.warning("worker process %s was ended: it went on after its request", pid)
         self._on_overdue()
 
     async def _replace(self, one: _Worker) -> None:

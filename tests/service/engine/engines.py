@@ -45,7 +45,7 @@ def make(
         max_image_bytes=limits.max_bytes,
         max_image_pixels=limits.max_pixels,
     )
-    observer = Observer(Metrics(), None)
+    observer = Observer(Metrics())
     return Engine(
         MapStore(maps_dir),
         of_workers,
