@@ -50,9 +50,9 @@ _WATCH_S = 1.0
 _RESTART_PAUSE_S = 1.0
 # Longest time for a process to begin, and for it to open a map that is in service.
 _START_LIMIT_S = 300.0
-# How long a process may go on with a task that nobody waits for any more, until its next step. A
-# new process takes about as long to begin and open a map (decision 0057).
-_STEP_LIMIT_S = 0.5
+# How long a process may go on with a task that nobody waits for any more, until its next step
+# (decision 0057): more than an ordinary photo takes in all.
+_STEP_LIMIT_S = 1.0
 _PING = methodcaller(str(Vision.ping))
 # The seconds by which a request falls back in the queue for each second that workers spent on it.
 # Twice as many as there are sequences at once by default: all together then take at most half of a
