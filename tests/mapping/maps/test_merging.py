@@ -144,10 +144,18 @@ def test_another_building_is_refused(halves: MapStore, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("method", "why"), [("rgbd", "is 1.2 times as far"), ("sfm", "a metre of theirs is 0.83")]
+    ("method", "factor", "why"),
+    [
+        ("rgbd", 1.2, "is 1.2 times as far"),
+        ("sfm", 1.2, "a metre of theirs is 0.83"),
+        ("rgbd", 3.2808, "a metre of theirs is 0.30"),
+        ("sfm", 3.2808, "a metre of theirs is 0.30"),
+    ],
 )
-def test_maps_of_different_metres_are_refused(halves: MapStore, method: str, why: str) -> None:
-    longer = Similarity(1.2, np.eye(3), np.zeros(3))
+def test_maps_of_different_metres_are_refused(
+    halves: MapStore, method: str, factor: float, why: str
+) -> None:
+    longer = Similarity(factor, np.eye(3), np.zeros(3))
     content = moved(content_of(halves.open("b")), longer, metric=True)
     # Depth tells of landmarks that depth made.
     settings = {**content.settings, "updates": [{"method": method}]}
