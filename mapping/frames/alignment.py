@@ -132,9 +132,9 @@ def tie(
         similarity = _refined(chosen, similarity, rigid=rigid)
         agrees = _agreeing(views, similarity, _AGREES)
     if (few := too_few(agrees[: len(photos)])) is not None:
-        free = tie(photos, back, rigid=False, seed=seed) if rigid else None
-        if isinstance(free, Tie):  # of units as far apart as feet and metres
-            other = _other_unit(photos, free.tied, free.there_from_here)
+        scaled = tie(photos, back, rigid=False, seed=seed) if rigid else None
+        if isinstance(scaled, Tie):  # of units as far apart as feet and metres
+            other = _other_unit(photos, scaled.tied, scaled.there_from_here)
             return NoTie(few if other is None else other, unit=other is not None)
         return NoTie(few)
     chosen = [view for view, use in zip(views, agrees, strict=True) if use]
