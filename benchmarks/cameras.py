@@ -368,14 +368,15 @@ def zoomed_maps(places: Places, scratch: Path) -> Iterator[str]:
     """Build maps of photos alone, of which every tenth has digital zoom."""
     yield "| EXIF contains the zoom | photos | placed | with zoom | wrong |\n|---|---|---|---|---|"
     dataset = read_dataset(places.dataset(SAMPLE, "mapping"))
-    left = [record for record in dataset.images if record.sensor_id == "left"]
     truth = _poses(dataset)
     for millimetres, count in ((25, 20), (25, 40), (40, 20), (40, 40)):
         name = f"zoomed-{millimetres}-{count}"
         folder = scratch / name / "photos"
         folder.mkdir(parents=True)
         zoomed = set()
-        for number, record in enumerate(left[:: max(len(left) // count, 1)][:count]):
+        evenly = np.linspace(0, len(dataset.images) - 1, count).round().astype(int)
+        taken = [dataset.images[row] for row in evenly]
+        for number, record in enumerate(taken):
             photo: Image.Image = Image.open(dataset.path_of(record))
             new = record.path.replace("/", "_")
             tags: dict[str, float] = {"FocalLengthIn35mmFilm": 25}

@@ -379,7 +379,7 @@ def test_a_version_that_a_set_names_stays_open_when_another_takes_over(
         os.kill(process, signal.SIGKILL)
         wait_until(lambda: engine.workers.pids not in ((process,), (0,), ()))
         client.localize(query.image, "room", query.camera)  # when it is ready
-        assert {before, "room@v2"} <= engine.workers.loaded.keys()
+        wait_until(lambda: {before, "room@v2"} <= engine.workers.loaded.keys())  # while idle
 
 
 def test_the_versions_that_sets_name_are_opened_at_the_start(site_copy: Path, serve: Serve) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +18,7 @@ from visloc.types import Uncertainty
 
 # What earlier photos of a sequence said of a camera, by its id in the rig and its intrinsics.
 CamerasSoFar = Mapping[tuple[str, Camera], LensEvidence]
-NO_CAMERAS: CamerasSoFar = MappingProxyType({})
+NO_CAMERAS: CamerasSoFar = {}
 # With corrected cameras, a pose explains no fewer matches than this part of those before.
 _LEAST_KEPT = 0.9
 
