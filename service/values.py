@@ -297,7 +297,7 @@ class SequenceStep(NamedTuple):
 
 
 class Signals(ctypes.Structure):
-    """What the main process and a worker process tell each other during a task, in shared memory.
+    """Flags in shared memory that the main process and a worker process exchange during a task.
 
     Attributes:
         abandoned: nobody waits for the task any more; the main process sets it.

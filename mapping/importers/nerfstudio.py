@@ -82,7 +82,7 @@ def read_recording(top: JsonValue, folder: Path) -> ImportedModel:
     """Read the content of a ``transforms.json``, as ``read``.
 
     Args:
-        folder: of the photos.
+        folder: the folder that holds the photos.
     """
     file = top.file
     frames = top["frames"].elements()

@@ -65,7 +65,7 @@ class Engine:
         max_upload_bytes: largest packed map.
         limit_s: longest time of one task of a worker.
         metrics: count events of maps and workers.
-        on_overdue: as of ``Workers``.
+        on_overdue: called for every worker process that is ended (see ``Workers``).
     """
 
     def __init__(

@@ -112,7 +112,7 @@ class _Queued:
     """A task, the future of its result, and the worker that runs it now; the least comes first.
 
     Attributes:
-        context: of the request.
+        context: context variables of the request, such as its key.
     """
 
     rank: float

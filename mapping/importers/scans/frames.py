@@ -1,4 +1,4 @@
-"""What all scans have in common: frames with poses become one model, in metres with y up.
+"""Turns the frames of a scan, which have poses, into one model, in metres with y up.
 
 Photos and depth go to a folder of their own: photos as links or files, depth maps as 16-bit PNGs in
 millimetres without the pixels of low confidence. A frame of a film counts if the camera has moved.
