@@ -97,7 +97,7 @@ PRIORS = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LensEvidence:
-    """What photos say of the change of a camera's lens; their poses and shutters are eliminated.
+    """Evidence of photos on the change of a camera's lens, with poses and shutters eliminated.
 
     Attributes:
         information: (4, 4)
