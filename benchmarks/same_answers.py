@@ -2,6 +2,7 @@
 
     python -m benchmarks.same_answers record ANSWERS --maps-dir MAPS     # before
     python -m benchmarks.same_answers compare ANSWERS --maps-dir MAPS    # after
+    python -m benchmarks.same_answers surfaces FOLDER                    # then diff -r two folders
 
 ``record`` builds the maps that are missing, starts the service and asks it about every query in
 every mode, over HTTP and over gRPC, through the command ``localize batch``. ``compare`` asks again
@@ -13,10 +14,12 @@ differently.
 from __future__ import annotations
 
 import json
+import os
+import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,6 +27,7 @@ from typing import Annotated, Any
 import typer
 
 from benchmarks.reliability.service_process import ServiceProcess
+from docs_site.http_reference import openapi_schema
 
 DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data"
 # Of an answer: what no two runs share.
@@ -140,6 +144,33 @@ def record(answers: Path, maps_dir: Annotated[Path, typer.Option()]) -> None:
     make_maps(maps_dir)
     ask(maps_dir, answers)
     typer.echo(f"{len(list(answers.glob('*.jsonl')))} files of answers in {answers}")
+
+
+@app.command()
+def surfaces(folder: Path) -> None:
+    """Write what users see without asking about a photo: --help of all commands, and OpenAPI."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for command in ("mapping", "localize", "visloc-service"):
+        for path in _subcommands((command,)):
+            (folder / f"{'_'.join(path)}.txt").write_text(_help(path), encoding="utf-8")
+    (folder / "openapi.json").write_text(
+        json.dumps(openapi_schema(), indent=1, sort_keys=True), encoding="utf-8"
+    )
+    typer.echo(f"{len(list(folder.iterdir()))} files in {folder}")
+
+
+def _help(path: tuple[str, ...]) -> str:
+    program = Path(sys.executable).with_name(path[0])
+    wide = {**os.environ, "COLUMNS": "160", "NO_COLOR": "1", "TERM": "dumb"}
+    run = (program, *path[1:], "--help")
+    return subprocess.run(run, check=True, capture_output=True, text=True, env=wide).stdout
+
+
+def _subcommands(path: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
+    yield path
+    listed = _help(path).partition("Commands")[2]
+    for name in re.findall(r"^│ ([a-z][a-z-]+) ", listed, flags=re.MULTILINE):
+        yield from _subcommands((*path, name))
 
 
 @app.command()

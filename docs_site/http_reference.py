@@ -16,7 +16,7 @@ Schema = dict[str, Any]
 
 def http_reference() -> str:
     """Return Markdown: a section for each route, then a table for each schema."""
-    schema = _openapi()
+    schema = openapi_schema()
     lines = ["## Routes", ""]
     for path, methods in schema["paths"].items():
         for method, operation in methods.items():
@@ -27,7 +27,8 @@ def http_reference() -> str:
     return "\n".join(lines)
 
 
-def _openapi() -> Schema:
+def openapi_schema() -> Schema:
+    """Return the description that a service with the default settings serves."""
     # The routes take from the backend only what decides which of them there are.
     settings = read_settings([], {}).model_copy(update={"page": False})
     access = SimpleNamespace(origins=())
