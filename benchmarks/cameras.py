@@ -31,8 +31,8 @@ from PIL import ExifTags, Image
 from scipy.special import chdtri
 
 from benchmarks.trust.maps import SAMPLE, Places, make_missing
-from mapping.build.build import build_map
-from mapping.build.settings import BuildSettings
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from mapping.frames.anchor import align_poses
 from mapping.importers import read_model
 from mapping.importers.dataset import write_imported

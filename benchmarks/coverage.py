@@ -27,8 +27,8 @@ import typer
 from numpy.typing import NDArray
 from scipy.stats import spearmanr
 
-from mapping.build.build import build_map
-from mapping.build.settings import BuildSettings
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from mapping.cluster.workers import Workers
 from mapping.report.held_out import hold_out
 from mapping.report.model import CoverageModel, Within, learn, tolerance_of

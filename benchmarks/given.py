@@ -18,8 +18,8 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from mapping.build.build import build_map
-from mapping.build.settings import BuildSettings
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from mapping.importers import read_model
 from mapping.importers.dataset import write_imported
 from mapping.sample import write_sample

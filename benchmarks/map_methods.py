@@ -19,8 +19,8 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from mapping.build.build import build_map
-from mapping.build.settings import BuildSettings
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from mapping.methods.sfm_settings import SfmSettings
 from visloc.archive import Map, open_map
 from visloc.evaluation import pose_error

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
-from mapping.build.build import build_map
-from mapping.build.settings import BuildSettings
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from mapping.cli.progress import StageProgress
 from mapping.cli.prune import accuracy_rows
 from mapping.maps.merging import merge_maps

@@ -26,8 +26,8 @@ from typing import Annotated, Any
 
 import typer
 
-from mapping.build.build import build_map
-from mapping.build.settings import BuildSettings
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from mapping.methods.sfm_settings import SfmSettings
 from visloc.archive import MapStore
 from visloc.evaluation import Threshold

@@ -21,8 +21,8 @@ from typing import Annotated, Any
 import typer
 
 from benchmarks.large_map import write_large_map
-from mapping.build.build import build_map
-from mapping.build.settings import BuildSettings
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from mapping.sample import write_sample
 from visloc.archive import open_map, verify_map
 

@@ -25,8 +25,8 @@ import numpy as np
 import typer
 
 from benchmarks.map_methods import BINS, Stopwatch, measure
-from mapping.build.build import build_map
-from mapping.build.settings import BuildSettings
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from mapping.maps.updating import UpdateSettings, update_map
 from visloc.archive import Map, open_map
 from visloc.errors import Conflict

@@ -66,8 +66,8 @@ def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def built_maps(sample: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of maps with the map ``room`` of the sample, made with SIFT; only to be read."""
-    from mapping.build.build import build_map
-    from mapping.build.settings import BuildSettings
+    from mapping.pipeline.build import build_map
+    from mapping.pipeline.settings import BuildSettings
 
     maps = tmp_path_factory.mktemp("maps")
     build_map(

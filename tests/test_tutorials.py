@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from mapping.build.build import build_map
-from mapping.build.settings import BuildSettings
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from mapping.sample import write_sample
 from tests import docs_check
 from tests.rosbags_made import write_bag

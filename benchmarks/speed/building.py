@@ -10,8 +10,8 @@ from typing import Any
 
 from benchmarks.speed.dataset import Bench
 from benchmarks.speed.machine import num_threads
-from mapping.build.build import build_map
-from mapping.build.settings import BuildSettings
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from mapping.methods.sfm_settings import SfmSettings
 from visloc.archive import open_map
 from visloc.options import Inference

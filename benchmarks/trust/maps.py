@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from mapping.build.build import build_map
-from mapping.build.settings import BuildSettings
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from mapping.maps.sets import publish_set
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.sample import write_sample

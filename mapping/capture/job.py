@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from mapping.build.build import build_map, refuse_existing_map
-from mapping.build.pieces import refuse_long_id
-from mapping.build.settings import BuildSettings
+from mapping.pipeline.build import build_map, refuse_existing_map
+from mapping.pipeline.pieces import refuse_long_id
+from mapping.pipeline.settings import BuildSettings
 from mapping.capture.frames import FilmedVideo, photo_name
 from mapping.capture.markers import find_markers, grey_photos
 from mapping.capture.placing import Yardstick, place

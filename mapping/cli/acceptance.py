@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from mapping.build.pieces import use_version
+from mapping.pipeline.pieces import use_version
 from mapping.cli.display import say
 from mapping.cluster.storage import open_store
 from mapping.options import CacheDirOption, PlacedMapsDirOption

@@ -9,8 +9,8 @@ from typing import Annotated
 
 import typer
 
-from mapping.build.build import build_map
-from mapping.build.settings import BuildSettings
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from mapping.cli.acceptance import require_acceptance
 from mapping.cli.display import (
     ERR,

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from mapping.build.pairs import PairsJob, write_pairs_of_dataset
+from mapping.pipeline.pairs import PairsJob, write_pairs_of_dataset
 from mapping.cli.build import CovisibleInOption
 from mapping.cli.display import ERR, print_rig, say, say_notes, say_peak_memory
 from mapping.cli.progress import StageProgress

@@ -38,7 +38,7 @@ ONE_THREAD = {
     "OPENCV_FOR_THREADS_NUM": "1",
 }
 
-_FORK_SERVER = "mapping.build.forkserver"
+_FORK_SERVER = "mapping.pipeline.forkserver"
 
 # The server's socket lies below the folder of temporary files. Its path has at most 107 bytes, of
 # which multiprocessing appends 32.

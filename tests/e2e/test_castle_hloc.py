@@ -11,8 +11,8 @@ import pytest
 from clients.evaluation.queries import Query
 from clients.evaluation.readers import FeatureReader
 from clients.evaluation.sent_matches import PhotoMatches
-from mapping.build.build import build_map
-from mapping.build.settings import BuildSettings
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from mapping.importers.hloc import import_features
 from mapping.methods.sfm_settings import SfmSettings
 from visloc.archive import open_map

@@ -160,8 +160,8 @@ def _fill_in_photo(body: dict[str, Any], photo: str | bytes) -> None:
 @contextmanager
 def served(folder: Path) -> Iterator[tuple[str, bytes]]:
     """Build a map of the synthetic sample and serve it in a process of its own."""
-    from mapping.build.build import build_map
-    from mapping.build.settings import BuildSettings
+    from mapping.pipeline.build import build_map
+    from mapping.pipeline.settings import BuildSettings
     from mapping.sample import write_sample
 
     write_sample(folder / "sample", images=8, size=(256, 192))

@@ -17,8 +17,8 @@ from moto.server import ThreadedMotoServer
 from numpy.typing import NDArray
 from s3fs import S3FileSystem
 
-from mapping.build.build import build_map
-from mapping.build.settings import BuildSettings
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from mapping.sample import write_sample
 from visloc.archive import Map, MapStore
 from visloc.evaluation import pose_error

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from clients import Instant, RigImage
-from mapping.build.build import build_map
-from mapping.build.settings import BuildSettings
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from mapping.maps.sets import publish_set
 from mapping.sample import write_sample
 from visloc.archive import MapStore

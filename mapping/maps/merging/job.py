@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mapping.build.pieces import without_pieces
+from mapping.pipeline.pieces import without_pieces
 from mapping.maps.editing import content_of, joined, moved, refuse_other_features, same_model
 from mapping.maps.merging.registration import Registration, register, updates_of
 from mapping.maps.sets import publish_set

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.build.pieces import without_pieces
+from mapping.pipeline.pieces import without_pieces
 from mapping.cluster.storage import map_folder, storage_failed, work_place
 from mapping.cluster.workers import Workers
 from mapping.maps.editing import content_of, joined

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.build.content import photo_content
+from mapping.pipeline.content import photo_content
 from mapping.maps.updating.capture import Capture
 from mapping.stages.landmarks import MadeLandmarks
 from mapping.stages.local_features import LocalFeaturesSource

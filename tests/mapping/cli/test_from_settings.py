@@ -10,8 +10,8 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from mapping.build.pairs import PairsJob
-from mapping.build.settings import BuildSettings
+from mapping.pipeline.pairs import PairsJob
+from mapping.pipeline.settings import BuildSettings
 from mapping.cli.build import ImportSettings
 from mapping.cli.from_settings import from_settings
 from mapping.cli.maps import AnchorSettings

@@ -17,8 +17,8 @@ from pathlib import Path
 import pytest
 from ray._raylet import Config
 
-from mapping.build.build import build_map
-from mapping.build.settings import BuildSettings
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from mapping.cluster import ray_pool
 from mapping.cluster.executors import open_executor
 from mapping.cluster.ray_pool import RayPool

@@ -11,8 +11,8 @@ import fsspec
 import numpy as np
 import pytest
 
-from mapping.build.build import build_map
-from mapping.build.settings import BuildSettings
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from mapping.cli.acceptance import use
 from mapping.cluster.storage import is_remote, open_store, opened_dataset, place_of, storage_failed
 from mapping.stages.work_folder import WorkFolder, key_of

@@ -10,8 +10,8 @@ import pycolmap
 import pytest
 from numpy.typing import NDArray
 
-from mapping.build.build import build_map
-from mapping.build.settings import BuildSettings
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from mapping.importers import import_dataset
 from mapping.maps.editing import content_of
 from mapping.maps.export import EXPORTERS, export_map

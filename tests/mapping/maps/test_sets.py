@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mapping.build.build import build_map
-from mapping.build.settings import BuildSettings
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from mapping.cli import main as cli
 from mapping.frames.set_poses import poses_on_earth, read_poses
 from mapping.maps.editing import content_of, moved

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapping.build.build import build_map
-from mapping.build.settings import BuildSettings
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from mapping.own_test import given_poses
 from mapping.own_test.given_poses import _distances, _factor, _is_along_ray, _Pair, _Written
 from mapping.stages.photos import MappingPhoto

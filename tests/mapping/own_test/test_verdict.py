@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 import pytest
 
-from mapping.build.build import build_map
-from mapping.build.settings import BuildSettings
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from mapping.cli.acceptance import require_acceptance, use
 from mapping.maps.editing import content_of
 from mapping.maps.merging import merge_maps

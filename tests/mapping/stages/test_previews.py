@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from mapping.build.build import build_map
-from mapping.build.settings import BuildSettings
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from mapping.cluster.workers import Workers
 from mapping.stages.context import BuildContext
 from mapping.stages.local_features import ExtractedFeatures

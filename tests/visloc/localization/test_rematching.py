@@ -146,8 +146,8 @@ def test_clear_pairs_alone_give_the_pose_too(localizer: Localizer, queries: list
 def test_a_map_of_xfeat_is_matched_by_its_network(
     sample: Path, tmp_path: Path, query: Query
 ) -> None:
-    from mapping.build.build import build_map
-    from mapping.build.settings import BuildSettings
+    from mapping.pipeline.build import build_map
+    from mapping.pipeline.settings import BuildSettings
 
     build_map(
         BuildSettings(sample / "mapping", "room", tmp_path, local_features="xfeat"), lambda *_: None

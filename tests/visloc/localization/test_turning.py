@@ -9,8 +9,8 @@ from typing import Protocol
 import numpy as np
 import pytest
 
-from mapping.build.build import build_map
-from mapping.build.settings import BuildSettings
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from tests.turning import turned_camera, turned_pixels, turned_pose
 from visloc.archive import MapStore
 from visloc.evaluation import pose_error

@@ -16,10 +16,10 @@ import pytest
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
-import mapping.build.build
+import mapping.pipeline.build
 import mapping.own_test.publishing
-from mapping.build.build import build_map
-from mapping.build.settings import BuildSettings
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from mapping.cluster.workers import Workers
 from mapping.methods.rgbd import DepthSettings
 from mapping.stages.networks import Networks
@@ -436,8 +436,8 @@ def test_a_build_on_a_cluster_computes_as_suits_the_machine_that_begins_it(
         asked.append(networks.inference)
         raise Stopped
 
-    monkeypatch.setattr(mapping.build.build, "open_executor", lambda *_: Workers(1))
-    monkeypatch.setattr(mapping.build.build, "local_features_source", note_source)
+    monkeypatch.setattr(mapping.pipeline.build, "open_executor", lambda *_: Workers(1))
+    monkeypatch.setattr(mapping.pipeline.build, "local_features_source", note_source)
     for executor in ("local", "ray"):
         with pytest.raises(Stopped):
             build_map(settings_for(sample / "mapping", tmp_path, executor=executor), quiet)
@@ -583,8 +583,8 @@ def test_a_file_that_cannot_be_written_whole_ends_the_command_with_one_line(
 def test_with_workers_the_main_process_loads_no_torch(sample: Path, tmp_path: Path) -> None:
     """It costs the main process two seconds and a quarter of a gigabyte."""
     program = (
-        "import sys; from pathlib import Path; from mapping.build.build import build_map;"
-        "from mapping.build.settings import BuildSettings;"
+        "import sys; from pathlib import Path; from mapping.pipeline.build import build_map;"
+        "from mapping.pipeline.settings import BuildSettings;"
         "from mapping.progress import nothing_told;"
         "settings = BuildSettings(Path(sys.argv[1]), 'room', Path(sys.argv[2]), workers=2);"
         "build_map(settings, nothing_told); print('torch' in sys.modules)"

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mapping.build.build import build_map
-from mapping.build.pieces import (
+from mapping.pipeline.build import build_map
+from mapping.pipeline.pieces import (
     WrittenMap,
     ids_of_pieces,
     note_of_piece,
@@ -21,7 +21,7 @@ from mapping.build.pieces import (
     use_version,
     without_pieces,
 )
-from mapping.build.settings import BuildSettings
+from mapping.pipeline.settings import BuildSettings
 from mapping.frames.anchor import align_poses
 from mapping.maps.editing import content_of
 from mapping.methods.sfm_settings import SfmSettings
@@ -292,7 +292,7 @@ def test_a_killed_publication_leaves_the_largest_as_it_was(
     def killed(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("mapping.build.pieces.publish_tested", killed)
+    monkeypatch.setattr("mapping.pipeline.pieces.publish_tested", killed)
     with pytest.raises(KeyboardInterrupt):
         publish(store, written("home"), written("home-2"))
     assert in_use(store)["home"] == before["home"]

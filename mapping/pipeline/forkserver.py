@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 
-import mapping.build.build  # noqa: F401  what tasks of a build need
+import mapping.pipeline.build  # noqa: F401  what tasks of a build need
 from visloc.preloading import load_torch_if_sure
 
 load_torch_if_sure()

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mapping.build.build import build_map
-from mapping.build.settings import BuildSettings
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.pairing import PAIRINGS, PairSettings
 from mapping.report.cameras import cameras_of

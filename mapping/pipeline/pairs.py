@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from mapping.build.checks import check_names
+from mapping.pipeline.checks import check_names
 from mapping.methods.scenes import find_pairs, make_scene
 from mapping.methods.sfm_settings import PairsOption, SfmSettings
 from mapping.options import DatasetArgument, FeaturesDirOption, Names, PixelOriginOption

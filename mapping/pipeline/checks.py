@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from mapping.build.settings import METHODS, BuildSettings
+from mapping.pipeline.settings import METHODS, BuildSettings
 from mapping.cluster.executors import EXECUTORS
 from mapping.cluster.storage import is_remote, lies_in, work_place
 from mapping.frames.anchor import MAX_DIRECTION_ERROR_DEG, known_positions

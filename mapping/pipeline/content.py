@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.build.settings import BuildSettings
+from mapping.pipeline.settings import BuildSettings
 from mapping.methods.sfm import known_rigs
 from mapping.options import Vector
 from mapping.stages.landmarks import MadeLandmarks

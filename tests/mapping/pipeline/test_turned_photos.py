@@ -12,8 +12,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mapping.build.build import build_map
-from mapping.build.settings import BuildSettings
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from mapping.maps.export_features import export_features
 from mapping.maps.updating import UpdateSettings, update_map
 from mapping.stages.photos import read_in_frame

@@ -10,9 +10,9 @@ from pathlib import Path
 
 from pydantic import JsonValue
 
-from mapping.build.checks import check_settings, refuse_early
-from mapping.build.content import build_content
-from mapping.build.pieces import (
+from mapping.pipeline.checks import check_settings, refuse_early
+from mapping.pipeline.content import build_content
+from mapping.pipeline.pieces import (
     WrittenMap,
     ids_of_pieces,
     note_of_largest,
@@ -20,7 +20,7 @@ from mapping.build.pieces import (
     publish_pieces,
     refuse_long_id,
 )
-from mapping.build.settings import BuildSettings
+from mapping.pipeline.settings import BuildSettings
 from mapping.cluster.executors import Executor, open_executor
 from mapping.cluster.stage_timings import Costs
 from mapping.cluster.storage import (
@@ -78,7 +78,7 @@ def build_map(
     """Build a map and publish it, as the current version unless its own test speaks against it.
 
     Photos without poses may fall apart into pieces. Each is published as a map of its own
-    (``mapping.build.pieces``).
+    (``mapping.pipeline.pieces``).
 
     If it is killed, the same call finds its finished work again. The version that was current
     before stays current until the new one is complete and verified.

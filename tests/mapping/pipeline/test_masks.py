@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mapping.build.build import build_map
-from mapping.build.settings import BuildSettings
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from mapping.stages.photos import read_in_frame
 from tests.turning import store_photo_turned
 from visloc.archive import Map, open_map
