@@ -30,7 +30,7 @@ from samples.trajectories import mapping_trajectory, stereo_rig
 from visloc.archive import Map, MapStore
 from visloc.geometry import Pose
 from visloc.kapture import Sensor
-from visloc.localization.geometry.constraints import MapGeometry
+from visloc.localization.map_view.constraints import MapGeometry
 
 NUM_PHOTOS, SIZE = 24, (320, 240)
 HEIGHT_M, AHEAD_M, ASIDE_M = 1.7, 1.5, 0.25

@@ -27,7 +27,7 @@ from visloc.geometry import Camera, Pose
 from visloc.images import Photo, read_photo_file
 from visloc.localization.acceptance.evidence import SeenView, evidence_of
 from visloc.localization.acceptance.gates import CONFIRMATIONS, GATES, Problem, first_refusal
-from visloc.localization.geometry.constraints import Constraints, MapGeometry
+from visloc.localization.map_view.constraints import Constraints, MapGeometry
 from visloc.localization.localizer import Localizer
 from visloc.options import LocalizeOptions
 from visloc.pose.views import MatchedView

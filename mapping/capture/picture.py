@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mapping.capture.trying import Trials
 from mapping.report.grid import Plan
 from visloc.archive import Map
-from visloc.localization.geometry.constraints import MapGeometry
+from visloc.localization.map_view.constraints import MapGeometry
 
 _SIDE, _MARGIN, _LEGEND = 1000, 60, 90
 _MOST_POINTS = 60_000

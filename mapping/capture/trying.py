@@ -17,7 +17,7 @@ from visloc.archive import Map, MapStore
 from visloc.archive.schema import Doubt
 from visloc.errors import MapCorrupt, NotFound
 from visloc.geometry import Pose
-from visloc.localization.geometry.constraints import MapGeometry
+from visloc.localization.map_view.constraints import MapGeometry
 from visloc.pose.colmap import project
 
 LOST_SIZE = "size"

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from visloc.archive import Map
 from visloc.geometry import Pose
-from visloc.localization.geometry.constraints import MapGeometry
+from visloc.localization.map_view.constraints import MapGeometry
 from visloc.localization.solving import Look, Matches, SeenImage, Solved, solve_instant
 from visloc.matching.correspondences import Correspondences, match_landmarks
 from visloc.matching.products import EightBitRows

@@ -31,7 +31,7 @@ from visloc.kapture import (
     write_global_features,
     write_local_features,
 )
-from visloc.localization.geometry.constraints import MapGeometry
+from visloc.localization.map_view.constraints import MapGeometry
 from visloc.options import Inference, ReadAs
 
 

@@ -15,7 +15,7 @@ from mapping.own_test.trials import left_out_with
 from mapping.own_test.verdict import MOST_WRONG
 from mapping.report.held_out import spread_photos
 from visloc.archive import CoarseIndex, Map
-from visloc.localization.geometry.constraints import MapGeometry
+from visloc.localization.map_view.constraints import MapGeometry
 from visloc.sets.choosing import TileScore, plan
 from visloc.sets.coarse import descriptor_of, ranked, score_without, words_of
 from visloc.sets.unheard import apart

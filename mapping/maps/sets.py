@@ -42,7 +42,7 @@ from visloc.archive.version_rules import checked_name
 from visloc.errors import MapCorrupt, NotFound, refuse
 from visloc.geodesy import ecef_from_geodetic, geodetic_from_enu
 from visloc.geometry import Similarity
-from visloc.localization.geometry.constraints import MapGeometry
+from visloc.localization.map_view.constraints import MapGeometry
 from visloc.priors import MAX_TILES
 from visloc.retrieval.inverted import MadeLists
 from visloc.sets.coarse import (

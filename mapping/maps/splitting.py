@@ -24,7 +24,7 @@ from visloc.archive.store import open_published
 from visloc.archive.version_rules import checked_name
 from visloc.errors import MapCorrupt, NotFound, VislocError, refuse
 from visloc.geometry import Similarity
-from visloc.localization.geometry.constraints import MapGeometry
+from visloc.localization.map_view.constraints import MapGeometry
 from visloc.priors import MAX_TILES
 
 _TILE_OF = "a tile of "  # in the notes of a tile, before the map

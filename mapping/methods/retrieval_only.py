@@ -1,6 +1,6 @@
 """No landmarks: a map of posed photos, whose queries triangulate around themselves.
 
-See ``visloc.localization.geometry.local_model``.
+See ``visloc.localization.map_view.local_model``.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.archive import Map
-from visloc.localization.geometry.constraints import MapGeometry
+from visloc.localization.map_view.constraints import MapGeometry
 
 _SIDE, _MARGIN = 1000, 40
 _GROUND, _LANDMARK, _PHOTO, _DOUBTED = (

@@ -24,8 +24,8 @@ from visloc.archive import Map, open_map
 from visloc.archive.schema import MAX_FACTOR, MAX_WRONG_SCORES, OwnTest, Score
 from visloc.geometry import Pose, center_covariance
 from visloc.localization.acceptance.judge import TIE_ANGLE, TIE_REACH_SHARE
-from visloc.localization.geometry.constraints import MapGeometry
-from visloc.localization.geometry.viewpoints import Viewpoints
+from visloc.localization.map_view.constraints import MapGeometry
+from visloc.localization.map_view.viewpoints import Viewpoints
 from visloc.options import LocalizeOptions
 from visloc.pose.map_errors import PHOTO_ONLY
 

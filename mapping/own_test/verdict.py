@@ -14,7 +14,7 @@ from mapping.own_test.trials import OwnTestRun
 from mapping.stages.landmarks import View
 from visloc.archive import Map
 from visloc.archive.schema import Doubt, OwnTest
-from visloc.localization.geometry.constraints import MapGeometry
+from visloc.localization.map_view.constraints import MapGeometry
 
 # Shares that no map at hand that localizes well comes near: of 17, those with exact poses have all
 # photos back, and the weakest of look-alike hallways one wrong photo of 12. The painted sample with

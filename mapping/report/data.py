@@ -22,8 +22,8 @@ from mapping.stages.work_folder import WorkFolder
 from visloc import __version__
 from visloc.archive import Map
 from visloc.geometry import Camera
-from visloc.localization.geometry.constraints import MapGeometry
-from visloc.localization.geometry.viewpoints import Viewpoints
+from visloc.localization.map_view.constraints import MapGeometry
+from visloc.localization.map_view.viewpoints import Viewpoints
 
 _MAX_CALIBRATION_BINS, _RUNS_PER_BIN = 10, 10
 # With fewer runs that failed, or succeeded, than this, what tells both apart is a guess.

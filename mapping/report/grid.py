@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from mapping.report.model import CoverageModel, Forecast
 from visloc.archive import Map
 from visloc.geometry import Camera, Pose
-from visloc.localization.geometry.viewpoints import Viewpoints
+from visloc.localization.map_view.viewpoints import Viewpoints
 
 NUM_DIRECTIONS = 12
 _NUM_CELLS = 320

@@ -24,8 +24,8 @@ from visloc.archive import Map, open_map
 from visloc.evaluation import pose_error
 from visloc.geometry import Pose
 from visloc.localization.acceptance.gates import registration_for
-from visloc.localization.geometry.constraints import MapGeometry
-from visloc.localization.geometry.viewpoints import Viewpoints
+from visloc.localization.map_view.constraints import MapGeometry
+from visloc.localization.map_view.viewpoints import Viewpoints
 from visloc.matching.correspondences import Correspondences
 from visloc.options import LocalizeOptions
 from visloc.pose.reprojection import reprojection_errors

@@ -20,8 +20,8 @@ from mapping.report.held_out import HeldOut, ask_photos, match_held_out, opened_
 from mapping.stages.work_folder import Item, WorkFolder, key_of
 from visloc import __version__
 from visloc.archive import Map
-from visloc.localization.geometry.constraints import MapGeometry
-from visloc.localization.geometry.viewpoints import Viewpoints
+from visloc.localization.map_view.constraints import MapGeometry
+from visloc.localization.map_view.viewpoints import Viewpoints
 from visloc.options import LocalizeOptions
 
 _REVISION = 2

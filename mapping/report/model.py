@@ -22,7 +22,7 @@ from mapping.report.rematch import Counted, Rematch, count, fit_rematch
 from mapping.report.sight import Absent, Sight, look_around
 from visloc.archive import Map
 from visloc.geometry import Camera, Pose
-from visloc.localization.geometry.viewpoints import Viewpoints
+from visloc.localization.map_view.viewpoints import Viewpoints
 
 # What counts as localized. In metric maps the high precision of Sattler et al. 2018, within shares
 # of the distance from which photos see: it would mean nothing around a coin, and too much above a

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mapping.report.places import Places
 from visloc.geometry import Camera, Pose
-from visloc.localization.geometry.viewpoints import Viewpoints
+from visloc.localization.map_view.viewpoints import Viewpoints
 from visloc.options import LocalizeOptions
 from visloc.pose.colmap import normalized_rays, project
 

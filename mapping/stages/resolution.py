@@ -9,7 +9,7 @@ from mapping.stages.local_features import ExtractedFeatures, LocalFeaturesSource
 from mapping.stages.photos import MappingPhoto
 from visloc.archive import Map
 from visloc.features.resolution import Resolution, WorkingResolution
-from visloc.localization.geometry.constraints import MapGeometry
+from visloc.localization.map_view.constraints import MapGeometry
 
 
 def at_one_resolution(

@@ -13,7 +13,7 @@ from visloc.archive.places import anchor_rms
 from visloc.errors import InvalidInput, refuse
 from visloc.geometry import Pose
 from visloc.images import Photo
-from visloc.localization.geometry.constraints import Constraints
+from visloc.localization.map_view.constraints import Constraints
 from visloc.localization.localizer import Localizer
 from visloc.localization.query.camera import MapCamera, resolve_camera
 from visloc.localization.solving import Look, SeenImage

@@ -21,7 +21,7 @@ from visloc.features.local.readymade import (
 )
 from visloc.features.resolution import WorkingResolution
 from visloc.images import Photo
-from visloc.localization.geometry.constraints import MapGeometry
+from visloc.localization.map_view.constraints import MapGeometry
 from visloc.localization.query.camera import query_resolution, resolve_camera
 from visloc.localization.query.feature_cache import FeatureCache, find_features
 from visloc.localization.query.fingerprints import check_fingerprint

@@ -48,7 +48,7 @@ from service.workers.sequences import SequenceRun
 from visloc.drawing.matches_picture import draw_overlay
 from visloc.errors import InvalidInput, VislocError
 from visloc.images import ImageLimits, Photo
-from visloc.localization.geometry.constraints import MapGeometry
+from visloc.localization.map_view.constraints import MapGeometry
 from visloc.localization.localizer import Localizer
 from visloc.localization.places import solve_photo
 from visloc.localization.solving import Look, SeenImage, Solved

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from visloc.geometry import Camera, Pose
-    from visloc.localization.geometry.constraints import MapGeometry
+    from visloc.localization.map_view.constraints import MapGeometry
     from visloc.localization.solving import Matches, SeenImage
 
 DOWN = np.array([0.0, 0.0, -1.0])
@@ -43,7 +43,7 @@ class Place:
     def geometry_of(self, centers: Any) -> MapGeometry:
         """That of a map with photos at these centres, relative to the origin."""
         from visloc.archive.schema import Parts
-        from visloc.localization.geometry.constraints import MapGeometry
+        from visloc.localization.map_view.constraints import MapGeometry
 
         local = np.asarray(centers, dtype=np.float64).reshape(-1, 3)
         identity = np.tile([1.0, 0.0, 0.0, 0.0], (len(local), 1))

@@ -19,7 +19,7 @@ from visloc.evaluation import CHI2_95_OF_3
 from visloc.features.framing import turned_points
 from visloc.geometry import Pose, covariance_from_center
 from visloc.images import turn_of, upright_from_stored
-from visloc.localization.geometry.constraints import Constraints, MapGeometry
+from visloc.localization.map_view.constraints import Constraints, MapGeometry
 from visloc.options import ReadAs
 from visloc.pose.average import average_pose, deviations
 from visloc.pose.centre import with_origin

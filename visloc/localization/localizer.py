@@ -24,7 +24,7 @@ from visloc.images import Photo
 from visloc.localization.acceptance.evidence import Shown
 from visloc.localization.acceptance.rivals import Proposed
 from visloc.localization.coarse import CoarsePoses
-from visloc.localization.geometry.constraints import Constraints, MapGeometry
+from visloc.localization.map_view.constraints import Constraints, MapGeometry
 from visloc.localization.photo_answer import photo_answer
 from visloc.localization.places import solve_photo
 from visloc.localization.query.camera import map_cameras, query_resolution, resolve_camera

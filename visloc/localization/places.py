@@ -24,7 +24,7 @@ from visloc.localization.acceptance.gates import (
     first_refusal,
 )
 from visloc.localization.acceptance.rivals import Proposed
-from visloc.localization.geometry.constraints import Constraints, MapGeometry
+from visloc.localization.map_view.constraints import Constraints, MapGeometry
 from visloc.localization.solving import Look, Matches, SeenImage, Solved, solve_instant
 from visloc.options import DEFAULT_PRESET, PRESETS, LocalizeOptions
 from visloc.pose.generalized import GeneralizedPose, refine_generalized_pose

@@ -12,7 +12,7 @@ from visloc.features.framing import turned_points, turned_size
 from visloc.features.networks.lightglue.model import SeenKeypoints
 from visloc.geometry import Camera
 from visloc.images import turn_of, upright_from_stored
-from visloc.localization.geometry.constraints import MapGeometry
+from visloc.localization.map_view.constraints import MapGeometry
 from visloc.matching.correspondences import Pairs
 from visloc.options import ReadAs
 from visloc.types import Evidence, LocalFeatures

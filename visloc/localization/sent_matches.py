@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from visloc.errors import refuse
-from visloc.localization.geometry.constraints import MapGeometry
+from visloc.localization.map_view.constraints import MapGeometry
 from visloc.matching.correspondences import Pairs, Proposals, proposals_of
 from visloc.types import LocalFeatures, QueryFeatures
 

@@ -21,7 +21,7 @@ from visloc.localization.acceptance.gates import Problem, accepted, not_better_e
 from visloc.localization.acceptance.judge import not_probable_enough
 from visloc.localization.acceptance.redraws import with_redraws
 from visloc.localization.acceptance.rivals import Proposed, stronger_place
-from visloc.localization.geometry.constraints import Constraints, MapGeometry
+from visloc.localization.map_view.constraints import Constraints, MapGeometry
 from visloc.localization.query.camera import guessed_camera
 from visloc.localization.turning import REASONS_OF_TURNED_PHOTOS
 from visloc.options import LocalizeOptions, ReadAs, Solver

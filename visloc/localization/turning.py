@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from visloc.features import GlobalDescriptor, LocalFeatureExtractor
 from visloc.features.framing import Framing
 from visloc.images import Photo, turn_of, upright_from_stored
-from visloc.localization.geometry.constraints import Constraints, MapGeometry
+from visloc.localization.map_view.constraints import Constraints, MapGeometry
 from visloc.localization.query.camera import query_resolution
 from visloc.localization.query.feature_cache import FeatureCache, find_features
 from visloc.matching.correspondences import CLEAR_RATIO, propose_landmarks

@@ -21,7 +21,7 @@ from visloc.geometry import center_covariance, covariance_from_center, rotation_
 from visloc.localization.acceptance.corrected_cameras import NO_CAMERAS
 from visloc.localization.acceptance.gates import contradicts_priors, registration_for
 from visloc.localization.acceptance.judge import not_probable_enough
-from visloc.localization.geometry.constraints import Constraints, MapGeometry
+from visloc.localization.map_view.constraints import Constraints, MapGeometry
 from visloc.localization.solving import (
     SeenImage,
     Solved,

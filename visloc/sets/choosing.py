@@ -61,7 +61,7 @@ def allowed_tiles(
     """Tell which tiles the priors allow.
 
     A tile is allowed if one of its photos may show what the device sees. The distances are those
-    of a single map (``visloc.localization.geometry.constraints``), measured from the bounding box
+    of a single map (``visloc.localization.map_view.constraints``), measured from the bounding box
     of the photos' centres: twice the viewing distance around a sphere, a quarter of the height
     around a band.
 

@@ -15,7 +15,7 @@ from mapping.maps.merging.describing import describe_together
 from visloc.archive import GlobalFeatures, Map
 from visloc.errors import VislocError, refuse
 from visloc.geometry import Pose
-from visloc.localization.geometry.constraints import MapGeometry
+from visloc.localization.map_view.constraints import MapGeometry
 from visloc.options import LocalizeOptions
 
 # Photos of each map that are tried, evenly chosen: a tie needs no more.

@@ -19,7 +19,7 @@ from visloc.evaluation import Threshold, median_errors_localized, pose_error
 from visloc.features import GlobalDescriptor, LocalFeatureExtractor
 from visloc.geometry import Pose
 from visloc.kapture import read_dataset
-from visloc.localization.geometry.constraints import MapGeometry
+from visloc.localization.map_view.constraints import MapGeometry
 from visloc.localization.localizer import Localizer
 from visloc.localization.query.feature_cache import FeatureCache
 from visloc.options import LocalizeOptions

@@ -23,7 +23,7 @@ from mapping.stages.publishing import PAIRS
 from visloc.archive import Map
 from visloc.archive.checks import json_text
 from visloc.archive.schema import photo_file
-from visloc.localization.geometry.constraints import MapGeometry
+from visloc.localization.map_view.constraints import MapGeometry
 
 # Cells of a photo, along its width and height.
 _CELLS = (8, 6)

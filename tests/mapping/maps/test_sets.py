@@ -34,7 +34,7 @@ from visloc.geometry import Pose, Similarity
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
 from visloc.localization.acceptance.judge import TIE_REACH_SHARE, PlaceAnswer, Tie, judge
-from visloc.localization.geometry.constraints import Constraints, MapGeometry
+from visloc.localization.map_view.constraints import Constraints, MapGeometry
 from visloc.localization.localizer import Localizer
 from visloc.localization.solving import SeenImage
 from visloc.options import LocalizeOptions

@@ -30,7 +30,7 @@ from visloc.features import make_local_features
 from visloc.geometry import Similarity
 from visloc.images import Photo, read_photo_file
 from visloc.kapture import read_dataset, write_dataset
-from visloc.localization.geometry.constraints import MapGeometry
+from visloc.localization.map_view.constraints import MapGeometry
 from visloc.localization.localizer import Localizer
 from visloc.options import LocalizeOptions
 from visloc.types import Localized, Uncertainty

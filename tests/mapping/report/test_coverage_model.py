@@ -13,7 +13,7 @@ from mapping.report.rematch import Rematch, count, fit_rematch
 from mapping.report.sight import Sight
 from mapping.stages.work_folder import WorkFolder
 from visloc.geometry import Camera
-from visloc.localization.geometry.constraints import MapGeometry
+from visloc.localization.map_view.constraints import MapGeometry
 from visloc.options import LocalizeOptions
 
 CAMERA = Camera("PINHOLE", 320, 240, (220.0, 220.0, 160.0, 120.0))

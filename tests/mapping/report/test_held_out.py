@@ -15,7 +15,7 @@ from mapping.report.held_out import (
     vanishing,
 )
 from mapping.stages.work_folder import WorkFolder
-from visloc.localization.geometry.constraints import MapGeometry
+from visloc.localization.map_view.constraints import MapGeometry
 from visloc.options import LocalizeOptions
 
 

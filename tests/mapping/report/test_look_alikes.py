@@ -12,7 +12,7 @@ from mapping.report.held_out import HeldOut, hold_out
 from mapping.report.look_alikes import Search, find_look_alikes, shares_place
 from mapping.stages.work_folder import WorkFolder
 from visloc.archive import Map
-from visloc.localization.geometry.constraints import MapGeometry
+from visloc.localization.map_view.constraints import MapGeometry
 
 _BETWEEN = 50.0  # from one room to the next; they look past each other
 _PER_ROOM = 6

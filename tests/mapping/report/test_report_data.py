@@ -15,7 +15,7 @@ from mapping.report.statistics import statistics_of
 from mapping.stages.work_folder import WorkFolder
 from visloc.archive import MapStore
 from visloc.geometry import Pose
-from visloc.localization.geometry.constraints import MapGeometry
+from visloc.localization.map_view.constraints import MapGeometry
 
 
 def report_of(opened, folder):

@@ -6,7 +6,7 @@ import pytest
 from mapping.report.places import sample_places
 from mapping.report.sight import Absent, look_around
 from visloc.geometry import Camera
-from visloc.localization.geometry.constraints import MapGeometry
+from visloc.localization.map_view.constraints import MapGeometry
 
 CAMERA = Camera("PINHOLE", 320, 240, (220.0, 220.0, 160.0, 120.0))
 

@@ -11,7 +11,7 @@ from tests.fuzz.tiny_map import write_tiny_map
 from visloc.archive import OwnTest, add_own_test, open_map, verify_map, write_tested
 from visloc.archive.schema import MAX_WRONG_SCORES
 from visloc.errors import MapCorrupt
-from visloc.localization.geometry.constraints import MapGeometry
+from visloc.localization.map_view.constraints import MapGeometry
 from visloc.pose.map_errors import PHOTO_ONLY
 from visloc.types import Uncertainty
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera, Pose, Similarity
-from visloc.localization.geometry.constraints import Constraints
+from visloc.localization.map_view.constraints import Constraints
 from visloc.options import ReadAs
 from visloc.pose.centre import moved_pose, position_covariance
 from visloc.pose.distance import mahalanobis2

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from visloc.geometry import Camera, Pose
-from visloc.localization.geometry.constraints import MapGeometry
+from visloc.localization.map_view.constraints import MapGeometry
 from visloc.matching.products import EightBitRows
 from visloc.pose.centre import position_covariance
 from visloc.pose.colmap import project

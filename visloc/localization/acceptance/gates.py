@@ -18,7 +18,7 @@ from visloc.geometry import Camera, Pose
 from visloc.localization.acceptance.camera_check import camera_contradiction
 from visloc.localization.acceptance.evidence import SeenView, Shown, evidence_of
 from visloc.localization.acceptance.probability import against, shipped_model
-from visloc.localization.geometry.constraints import Constraints
+from visloc.localization.map_view.constraints import Constraints
 from visloc.options import (
     DEFAULT_PRESET,
     LEAST_PROBABILITY,

@@ -28,7 +28,7 @@ from visloc.localization.acceptance.gates import (
     first_refusal,
 )
 from visloc.localization.acceptance.preference import SURE, preference
-from visloc.localization.geometry.constraints import MapGeometry
+from visloc.localization.map_view.constraints import MapGeometry
 from visloc.matching.correspondences import Proposals, propose_landmarks
 from visloc.matching.products import round_descriptors
 from visloc.pose.centre import largest_std, moved_origin

@@ -23,7 +23,7 @@ from visloc.localization.acceptance.evidence import (
 )
 from visloc.localization.acceptance.gates import Problem, likely
 from visloc.localization.acceptance.probability import read_model, shipped_model
-from visloc.localization.geometry.constraints import Constraints
+from visloc.localization.map_view.constraints import Constraints
 from visloc.localization.localizer import Localizer
 from visloc.matching.products import EightBitRows
 from visloc.options import LocalizeOptions

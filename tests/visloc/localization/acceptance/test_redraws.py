@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from visloc.geometry import Pose, center_covariance
 from visloc.localization.acceptance import redraws
 from visloc.localization.acceptance.gates import Problem
-from visloc.localization.geometry.constraints import Constraints
+from visloc.localization.map_view.constraints import Constraints
 from visloc.localization.solving import Matches, SeenImage, Solved, solve_instant
 from visloc.options import LocalizeOptions
 from visloc.pose.colmap import normalized_rays

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.visloc.localization.geometry.test_constraints import Building, assert_on
+from tests.visloc.localization.map_view.test_constraints import Building, assert_on
 from visloc.archive import MapStore
 from visloc.geometry import Pose
 from visloc.localization.acceptance.preference import SURE, preference

@@ -19,8 +19,8 @@ from visloc.archive.places import located
 from visloc.errors import refuse
 from visloc.features.resolution import Resolution, WorkingResolution
 from visloc.geometry import Pose
-from visloc.localization.geometry.local_model import LocalModel
-from visloc.localization.geometry.viewpoints import Viewpoints
+from visloc.localization.map_view.local_model import LocalModel
+from visloc.localization.map_view.viewpoints import Viewpoints
 from visloc.matching.products import EightBitRows
 from visloc.pose.centre import largest_std, with_origin
 from visloc.pose.colmap import normalized_rays
