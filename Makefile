@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 # What is made last of it.
-PAGE := visloc_web/built/report/report.js
+PAGE := service/page/built/report/report.js
 PAGE_SOURCES := $(shell find web/src web/client/src web/*.html web/*.json web/client/*.json web/*.ts -type f)
 
 .DEFAULT_GOAL := help
@@ -83,10 +83,10 @@ docs-check: install ## run the commands that the docs print, or parse those that
 	$(BIN)/python -m tests.docs_check $(PAGES)
 
 site: install ## write the documentation as a site to .site, with warnings as errors
-	PYTHONPATH=. $(BIN)/sphinx-build --quiet --fail-on-warning --keep-going -c docs_site . .site
+	PYTHONPATH=. $(BIN)/sphinx-build --quiet --fail-on-warning --keep-going -c tools/site . .site
 
 docs-links: install ## ask the hosts that the documentation links to
-	PYTHONPATH=. $(BIN)/sphinx-build --quiet -b linkcheck -c docs_site . .site-links
+	PYTHONPATH=. $(BIN)/sphinx-build --quiet -b linkcheck -c tools/site . .site-links
 
 docs-errors: install ## write the tables of error codes from visloc/error_codes.toml
 	$(BIN)/python -m tests.error_docs
@@ -94,11 +94,11 @@ docs-errors: install ## write the tables of error codes from visloc/error_codes.
 docs-options: install ## write the table of options from visloc/options.py
 	$(BIN)/python -m tests.option_docs
 
-licences: install ## write docs/licences.md, and check it against supply_chain/policy.toml
-	$(BIN)/python -m supply_chain.licences --write
+licences: install ## write docs/licences.md, and check it against tools/supply_chain/policy.toml
+	$(BIN)/python -m tools.supply_chain.licences --write
 
 lock: install ## write docker/locks from constraints.txt, with the hashes of the package index
-	$(BIN)/python -m supply_chain.lock
+	$(BIN)/python -m tools.supply_chain.lock
 
 # What an image holds: its lock, and torch, which no lock has.
 define held_by
@@ -172,7 +172,7 @@ check-page: page ## types, format and unit tests of web/
 	else echo 'The page is not checked: there is no Node.js.' >&2; fi
 
 licences-check: install ## dependencies have licences that the policy allows
-	$(BIN)/python -m supply_chain.licences
+	$(BIN)/python -m tools.supply_chain.licences
 
 check: lint types contracts licences-check proto-check check-page site ## what must be green before review
 
@@ -180,4 +180,4 @@ serve: install ## serve the maps in maps/ on 127.0.0.1:8000 (HTTP) and :50051 (g
 	$(BIN)/python -m service --maps-dir maps
 
 clean: ## remove what make made
-	rm -rf $(VENV) .site .site-links .sbom .demo .bench .change .results .trust web/node_modules web/client/dist visloc_web/built
+	rm -rf $(VENV) .site .site-links .sbom .demo .bench .change .results .trust web/node_modules web/client/dist service/page/built

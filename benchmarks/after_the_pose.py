@@ -27,12 +27,12 @@ from visloc.archive import Map, MapStore
 from visloc.evaluation import pose_error
 from visloc.features import make_global_descriptor, make_local_features
 from visloc.geometry import Camera, Pose
-from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
 from visloc.localization.localizer import Localizer
 from visloc.localization.query.feature_cache import FeatureCache
 from visloc.matching.correspondences import Correspondences, settled
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import read_photo_file
 from visloc.pose.colmap import project
 from visloc.pose.generalized import refine_generalized_pose
 from visloc.pose.views import MatchedView

@@ -31,22 +31,22 @@ from PIL import ExifTags, Image
 from scipy.special import chdtri
 
 from benchmarks.trust.maps import SAMPLE, Places, make_missing
-from mapping.pipeline.build import build_map
-from mapping.pipeline.settings import BuildSettings
 from mapping.frames.anchor import align_poses
 from mapping.importers import read_model
 from mapping.importers.dataset import write_imported
 from mapping.methods.sfm_settings import SfmSettings
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from samples.render import render_photo
 from samples.scene import make_room
 from visloc.archive import Map, MapStore
 from visloc.features import make_global_descriptor, make_local_features
 from visloc.geometry import Camera, PixelOrigin, Pose, Similarity, rotation_angle
-from visloc.images import read_photo_file
 from visloc.kapture import Dataset, FileRecord, read_dataset
 from visloc.localization.localizer import Localizer
 from visloc.localization.solving import SeenImage
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import read_photo_file
 from visloc.pose.centre import position_covariance
 from visloc.priors import NO_PRIORS
 from visloc.sequences.filling import TimeUnit

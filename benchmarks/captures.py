@@ -36,10 +36,10 @@ from visloc.features import make_global_descriptor, make_local_features
 from visloc.geodesy import enu_from_geodetic
 from visloc.geometry import Camera, Pose, Similarity
 from visloc.geopose import earth_covariance
-from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
 from visloc.localization.localizer import Localizer
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import read_photo_file
 from visloc.types import Localized
 
 WALK_RATE, HALLWAY_RATE = 10, 5

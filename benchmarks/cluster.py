@@ -21,10 +21,10 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from mapping.pipeline.build import build_map
-from mapping.pipeline.settings import BuildSettings
 from mapping.cli.display import print_costs
 from mapping.cluster.stage_timings import Costs
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from visloc.archive import open_map
 from visloc.features import DEFAULT_LOCAL_FEATURES
 from visloc.kapture import read_dataset, write_dataset

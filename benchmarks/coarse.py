@@ -29,11 +29,11 @@ from visloc.archive import MapStore
 from visloc.evaluation import CHI2_95_OF_3, calibration, pose_error
 from visloc.features import make_global_descriptor, make_local_features
 from visloc.geometry import Pose
-from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
 from visloc.localization.localizer import Localizer
 from visloc.localization.query.feature_cache import FeatureCache
 from visloc.options import Fallback, LocalizeOptions
+from visloc.photos.reading import read_photo_file
 from visloc.pose.average import average_pose
 from visloc.retrieval.interpolation import WEIGHTINGS, joined
 from visloc.types import CoarsePose, Localized

@@ -27,9 +27,9 @@ import typer
 from numpy.typing import NDArray
 from scipy.stats import spearmanr
 
+from mapping.cluster.workers import Workers
 from mapping.pipeline.build import build_map
 from mapping.pipeline.settings import BuildSettings
-from mapping.cluster.workers import Workers
 from mapping.report.held_out import hold_out
 from mapping.report.model import CoverageModel, Within, learn, tolerance_of
 from mapping.stages.work_folder import WorkFolder
@@ -39,11 +39,11 @@ from visloc.archive import Map, MapStore
 from visloc.evaluation import pose_error
 from visloc.features import make_global_descriptor, make_local_features
 from visloc.geometry import Camera, Pose
-from visloc.images import read_photo_file
 from visloc.kapture import Dataset, FileRecord, Sensor, read_dataset, write_dataset
-from visloc.localization.map_view.constraints import MapGeometry
 from visloc.localization.localizer import Localizer
+from visloc.localization.map_view.constraints import MapGeometry
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import read_photo_file
 from visloc.types import Localized
 
 _SYNTHETIC_FEATURES = "sift"

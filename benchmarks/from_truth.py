@@ -18,11 +18,11 @@ from benchmarks.speed.tables import table
 from visloc.archive import MapStore
 from visloc.features import make_local_features
 from visloc.geometry import Pose
-from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
 from visloc.localization.acceptance.gates import registration_for
 from visloc.localization.localizer import Localizer
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import read_photo_file
 from visloc.pose.centre import moved_origin
 from visloc.pose.generalized import refine_generalized_pose
 from visloc.pose.views import MatchedView

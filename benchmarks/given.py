@@ -18,10 +18,10 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from mapping.pipeline.build import build_map
-from mapping.pipeline.settings import BuildSettings
 from mapping.importers import read_model
 from mapping.importers.dataset import write_imported
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from mapping.sample import write_sample
 from visloc.archive import MapStore
 from visloc.errors import NotFound, VislocError

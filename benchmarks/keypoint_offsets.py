@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 from benchmarks.speed.tables import table
 from visloc.features import make_local_features
 from visloc.features.networks.r2d2.extractor import PATCH_PX
-from visloc.images import read_photo_file
+from visloc.photos.reading import read_photo_file
 
 _MAX_KEYPOINTS = 20_000
 # Of the finer scale's pixels: keypoints farther apart are of different corners.

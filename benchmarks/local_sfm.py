@@ -18,10 +18,10 @@ import typer
 from visloc.archive import MapStore
 from visloc.evaluation import pose_error
 from visloc.features import make_local_features
-from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
 from visloc.localization.localizer import Localizer
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import read_photo_file
 from visloc.types import Localized
 
 

@@ -19,16 +19,16 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from mapping.methods.sfm_settings import SfmSettings
 from mapping.pipeline.build import build_map
 from mapping.pipeline.settings import BuildSettings
-from mapping.methods.sfm_settings import SfmSettings
 from visloc.archive import Map, open_map
 from visloc.evaluation import pose_error
 from visloc.features import DEFAULT_LOCAL_FEATURES, make_global_descriptor, make_local_features
-from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
 from visloc.localization.localizer import Localizer
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import read_photo_file
 from visloc.types import Localized
 
 # Stages that depend on the way; features and global descriptors do not.

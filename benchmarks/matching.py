@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 
 from visloc.archive import MapStore
 from visloc.features import make_global_descriptor, make_local_features
-from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
 from visloc.localization.localizer import Localizer
 from visloc.matching import compiled
@@ -32,6 +31,7 @@ from visloc.matching.compiled import NearestColumns
 from visloc.matching.nearest import nearest_by_torch
 from visloc.matching.products import EightBitRows
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import read_photo_file
 
 # The descriptors of a query and those of each photo that it is matched with.
 Matched = tuple[EightBitRows, Sequence[EightBitRows]]

@@ -26,9 +26,9 @@ from typing import Annotated, Any
 
 import typer
 
+from mapping.methods.sfm_settings import SfmSettings
 from mapping.pipeline.build import build_map
 from mapping.pipeline.settings import BuildSettings
-from mapping.methods.sfm_settings import SfmSettings
 from visloc.archive import MapStore
 from visloc.evaluation import Threshold
 from visloc.in_process import open_map

@@ -20,10 +20,10 @@ from benchmarks.trust.maps import Places
 from visloc.evaluation import pose_error
 from visloc.features import make_local_features
 from visloc.geometry import Camera, Pose
-from visloc.images import Photo, read_photo_file
 from visloc.kapture import read_dataset
 from visloc.localization.localizer import Localizer
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import Photo, read_photo_file
 from visloc.types import Localized
 
 # An answer is right within half a unit and five degrees, as in docs/trust.md.

@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 import mapping.methods.matching.stages
 from clients.evaluation.queries import read_queries
 from clients.evaluation.readers import FeatureReader
+from mapping.methods.sfm_settings import SfmSettings
 from mapping.pipeline.build import build_map
 from mapping.pipeline.settings import BuildSettings
-from mapping.methods.sfm_settings import SfmSettings
 from mapping.stages.local_features import ReadyMadeFeatures
 from mapping.stages.photos import MappingPhoto
 from visloc.archive import Map, open_map

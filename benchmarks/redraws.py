@@ -32,8 +32,8 @@ from visloc.geometry import Pose
 from visloc.localization.acceptance.gates import Problem, accepted
 from visloc.localization.acceptance.judge import TIE_ANGLE, TIE_REACH_SHARE
 from visloc.localization.acceptance.redraws import crowding, widening, with_redraws
-from visloc.localization.map_view.constraints import Constraints
 from visloc.localization.localizer import Localizer
+from visloc.localization.map_view.constraints import Constraints
 from visloc.options import LocalizeOptions
 from visloc.pose.centre import moved_origin, position_covariance
 from visloc.pose.views import MatchedView

@@ -28,10 +28,10 @@ from visloc.archive import MapStore
 from visloc.evaluation import pose_error
 from visloc.features import make_local_features
 from visloc.geometry import Pose
-from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
 from visloc.localization.localizer import Localizer
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import read_photo_file
 from visloc.pose.covariance import pose_covariance
 from visloc.pose.refinement import LOSS_SCALE_PX, RefinedPose, refine
 from visloc.pose.reprojection import reprojection_errors

@@ -43,11 +43,11 @@ from visloc.archive import Map, MapStore
 from visloc.features import make_global_descriptor, make_local_features
 from visloc.features.local.readymade import is_ready_made
 from visloc.geometry import Camera, Pose
-from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
 from visloc.localization.localizer import Localizer
 from visloc.localization.query.feature_cache import FeatureCache
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import read_photo_file
 from visloc.pose.colmap import project
 from visloc.retrieval.fusion import FUSION_OPERATORS, LateFusion
 from visloc.retrieval.index import retrieve

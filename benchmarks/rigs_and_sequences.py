@@ -25,11 +25,11 @@ from visloc.archive import MapStore
 from visloc.evaluation import percentile, pose_error
 from visloc.features import make_global_descriptor, make_local_features
 from visloc.geometry import Camera, Pose
-from visloc.images import ImageLimits, read_photo
 from visloc.kapture import Dataset, read_dataset
 from visloc.localization.localizer import Localizer
 from visloc.localization.solving import Look, SeenImage
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import ImageLimits, read_photo
 from visloc.priors import NO_PRIORS
 from visloc.sequences.filling import Odometry, TimeUnit, TracedPose, fill_rig, interpolate_pose
 from visloc.sequences.solver import SeenInstant, SequenceSolver

@@ -27,7 +27,7 @@ from typing import Annotated, Any
 import typer
 
 from benchmarks.reliability.service_process import ServiceProcess
-from docs_site.http_reference import openapi_schema
+from tools.site.http_reference import openapi_schema
 
 DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data"
 # Of an answer: what no two runs share.
@@ -160,10 +160,10 @@ def surfaces(folder: Path) -> None:
 
 
 def _help(path: tuple[str, ...]) -> str:
-    program = Path(sys.executable).with_name(path[0])
+    program = str(Path(sys.executable).with_name(path[0]))
     wide = {**os.environ, "COLUMNS": "160", "NO_COLOR": "1", "TERM": "dumb"}
-    run = (program, *path[1:], "--help")
-    return subprocess.run(run, check=True, capture_output=True, text=True, env=wide).stdout
+    asked = [program, *path[1:], "--help"]
+    return subprocess.run(asked, check=True, stdout=subprocess.PIPE, text=True, env=wide).stdout
 
 
 def _subcommands(path: tuple[str, ...]) -> Iterator[tuple[str, ...]]:

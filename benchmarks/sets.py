@@ -27,9 +27,9 @@ from service.telemetry.metrics import Metrics
 from service.values import Localization, RigJob, WorkerSettings, photo_job
 from visloc.archive import MapStore
 from visloc.geometry import Similarity
-from visloc.images import ImageLimits
 from visloc.kapture import read_dataset
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import ImageLimits
 from visloc.types import Reason
 
 APART_M = 10_000.0

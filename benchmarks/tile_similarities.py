@@ -39,9 +39,9 @@ from mapping.maps.coarse_model import learn_of_words
 from visloc.archive import Map, MapStore
 from visloc.features import LocalFeatureExtractor, make_local_features
 from visloc.features.descriptors.whitening import unit_rows
-from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
 from visloc.options import Extraction
+from visloc.photos.reading import read_photo_file
 from visloc.retrieval.inverted import MadeLists
 from visloc.sets.coarse import (
     CoarseModel,

@@ -20,10 +20,10 @@ from benchmarks.photo_sizes import Row, row_of, write
 from benchmarks.trust.maps import Places
 from visloc.features import make_local_features
 from visloc.geometry import CAMERA_MODELS, Camera, Pose
-from visloc.images import Photo, read_photo_file
 from visloc.kapture import read_dataset
 from visloc.localization.localizer import Localizer
 from visloc.options import LocalizeOptions, ReadAs
+from visloc.photos.reading import Photo, read_photo_file
 
 # Side of the square, as a share of the photo's shorter side: it lies in the photo at any roll.
 _SQUARE = 0.7

@@ -25,9 +25,9 @@ import numpy as np
 import typer
 
 from benchmarks.map_methods import BINS, Stopwatch, measure
+from mapping.maps.updating import UpdateSettings, update_map
 from mapping.pipeline.build import build_map
 from mapping.pipeline.settings import BuildSettings
-from mapping.maps.updating import UpdateSettings, update_map
 from visloc.archive import Map, open_map
 from visloc.errors import Conflict
 from visloc.evaluation import pose_error

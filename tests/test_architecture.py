@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-PACKAGES = ("visloc", "mapping", "service", "clients", "visloc_api", "visloc_web", "training")
+PACKAGES = ("visloc", "mapping", "service", "clients", "visloc_api", "training")
 
 
 def mapped() -> Iterator[str]:

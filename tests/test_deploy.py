@@ -320,8 +320,8 @@ def test_the_page_is_made_in_a_stage_of_its_own_from_its_sources() -> None:
     assert steps[packages + 1].startswith("npm ci ")
     assert sources > packages + 1  # packages change less often than code
     assert steps[sources + 1] == "npm run build"
-    assert "--from=page /src/visloc_web/built visloc_web/built" in stages["code"].of("COPY")
-    assert {"visloc_web/built", "web/node_modules"} <= set(ignored)
+    assert "--from=page /src/service/page/built service/page/built" in stages["code"].of("COPY")
+    assert {"service/page/built", "web/node_modules"} <= set(ignored)
     # Who runs an image has no Node.js in it.
     assert [name for name, stage in stages.items() if stage.base in ("page", "${NODE}")] == ["page"]
 
@@ -348,7 +348,7 @@ def test_only_what_is_copied_is_sent_to_the_builder() -> None:
 def test_a_wheel_carries_the_built_page_and_the_report_and_nothing_else_of_web(
     tmp_path: Path,
 ) -> None:
-    built = ROOT / "visloc_web" / "built"
+    built = ROOT / "service" / "page" / "built"
     if not (built / "page" / "redoc.html").is_file():
         pytest.skip("the page is not built: `make page`, where Node.js is")
     subprocess.run(
@@ -364,8 +364,8 @@ def test_a_wheel_carries_the_built_page_and_the_report_and_nothing_else_of_web(
 
     files = {path.relative_to(ROOT).as_posix() for path in built.rglob("*") if path.is_file()}
     assert {"index.html", "report.js"} <= {Path(name).name for name in files}
-    assert any(name.startswith("visloc_web/built/page/assets/") for name in files)
-    assert {name for name in carried if name.startswith("visloc_web/built/")} == files
+    assert any(name.startswith("service/page/built/page/assets/") for name in files)
+    assert {name for name in carried if name.startswith("service/page/built/")} == files
     assert not any("node_modules" in name or name.startswith("web/") for name in carried)
 
 

@@ -17,10 +17,7 @@ from visloc import errors
 from visloc.errors import InvalidInput, VislocError, catalogue, refuse
 
 ROOT = Path(__file__).resolve().parents[1]
-PACKAGES = (
-    *("visloc", "visloc_api", "mapping", "service", "clients", "training", "visloc_web"),
-    "benchmarks",
-)
+PACKAGES = (*("visloc", "visloc_api", "mapping", "service", "clients", "training", "benchmarks"),)
 KINDS = {
     name
     for name, value in vars(errors).items()

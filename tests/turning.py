@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from visloc.geometry import Camera, Pose
-from visloc.images import read_photo_file
 from visloc.kapture import Dataset, FileRecord, Sensor, read_dataset, write_dataset
+from visloc.photos.reading import read_photo_file
 
 # Counterclockwise quarter turns from the upright picture to the stored pixels. Orientations 2, 4, 5
 # and 7 ask viewers to mirror the picture as well; the stored pixels are what the camera saw.

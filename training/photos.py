@@ -21,7 +21,7 @@ from torch import Tensor
 
 from training.files import read_about, write_tensors
 from visloc.errors import NotFound, refuse
-from visloc.images import read_photo
+from visloc.photos.reading import read_photo
 
 VALIDATION = "validation"
 _RESEARCH_SUFFIX = "_research"  # of folders whose licences do not allow every use

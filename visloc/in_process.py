@@ -23,13 +23,13 @@ from visloc.features import make_global_descriptor, make_local_features
 from visloc.features.local.readymade import is_ready_made
 from visloc.features.networks.lightglue.load import make_lightglue
 from visloc.geometry import Camera, Pose
-from visloc.images import Photo, read_photo_file
 from visloc.kapture import read_dataset
 from visloc.localization.localizer import Localizer
 from visloc.localization.places import solve_photo
 from visloc.localization.solving import Look, SeenImage
 from visloc.options import LocalizeOptions
-from visloc.photo_formats import SUFFIXES
+from visloc.photos.formats import SUFFIXES
+from visloc.photos.reading import Photo, read_photo_file
 from visloc.priors import NO_PRIORS, Priors
 from visloc.types import Answer, Localized, NotLocalized, Refusal
 

@@ -19,8 +19,8 @@ from visloc.drawing.detail_levels import detail_order
 from visloc.drawing.matches_picture import draw_overlay, read_preview
 from visloc.errors import refuse
 from visloc.geometry import Camera, Pose
-from visloc.images import read_photo_file
 from visloc.in_process import LocalMap, PhotoResult, require
+from visloc.photos.reading import read_photo_file
 from visloc.pose.colmap import project
 from visloc.types import Localized
 

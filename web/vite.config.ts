@@ -20,7 +20,7 @@ export default defineConfig({
   plugins: [redocForBrowsers],
   resolve: { tsconfigPaths: true },
   build: {
-    outDir: "../visloc_web/built/page",
+    outDir: "../service/page/built/page",
     emptyOutDir: true,
     assetsInlineLimit: 0, // the page's Content-Security-Policy allows no data: scripts or styles
     modulePreload: { polyfill: false },

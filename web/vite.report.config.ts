@@ -4,7 +4,7 @@ import { defineConfig } from "vite";
 export default defineConfig({
   resolve: { tsconfigPaths: true },
   build: {
-    outDir: "../visloc_web/built/report",
+    outDir: "../service/page/built/report",
     emptyOutDir: true,
     assetsInlineLimit: 1_000_000,
     chunkSizeWarningLimit: 1500,

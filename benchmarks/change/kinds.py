@@ -22,7 +22,7 @@ from samples.scene import NUM_SURFACES, Rectangle, Scene, make_room
 from training.augmentation import augment
 from training.conditions import Conditions, draw_conditions
 from visloc.geometry import Camera, Pose
-from visloc.images import Photo
+from visloc.photos.reading import Photo
 
 Taken = tuple[Photo, Camera]
 _ROOM_SEED, _OTHER_SEED = 0, 1000

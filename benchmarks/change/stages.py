@@ -15,8 +15,8 @@ from visloc.features import GlobalDescriptor, make_global_descriptor
 from visloc.features.local.readymade import is_ready_made
 from visloc.geometry import Pose
 from visloc.localization.acceptance.gates import Problem
-from visloc.localization.map_view.constraints import Constraints
 from visloc.localization.localizer import Localizer
+from visloc.localization.map_view.constraints import Constraints
 from visloc.localization.query.feature_cache import FeatureCache
 from visloc.localization.solving import Look
 from visloc.options import LocalizeOptions

@@ -24,12 +24,12 @@ from visloc.archive import Map
 from visloc.evaluation import pose_error
 from visloc.features.base import LocalFeatureExtractor
 from visloc.geometry import Camera, Pose
-from visloc.images import Photo, read_photo_file
 from visloc.localization.acceptance.evidence import SeenView, evidence_of
 from visloc.localization.acceptance.gates import CONFIRMATIONS, GATES, Problem, first_refusal
-from visloc.localization.map_view.constraints import Constraints, MapGeometry
 from visloc.localization.localizer import Localizer
+from visloc.localization.map_view.constraints import Constraints, MapGeometry
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import Photo, read_photo_file
 from visloc.pose.views import MatchedView
 from visloc.priors import NO_PRIORS
 

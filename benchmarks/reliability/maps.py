@@ -8,10 +8,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from mapping.pipeline.build import build_map
-from mapping.pipeline.settings import BuildSettings
 from mapping.maps.packing import write_packed
 from mapping.methods.rgbd import DepthSettings
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from mapping.sample import write_sample
 from visloc.archive import MapStore, verify_map
 from visloc.geometry import Camera, Pose

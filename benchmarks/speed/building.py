@@ -10,9 +10,9 @@ from typing import Any
 
 from benchmarks.speed.dataset import Bench
 from benchmarks.speed.machine import num_threads
+from mapping.methods.sfm_settings import SfmSettings
 from mapping.pipeline.build import build_map
 from mapping.pipeline.settings import BuildSettings
-from mapping.methods.sfm_settings import SfmSettings
 from visloc.archive import open_map
 from visloc.options import Inference
 

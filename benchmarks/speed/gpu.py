@@ -33,10 +33,10 @@ from benchmarks.speed.tables import describe_machine, number, table
 from visloc.archive import MapStore, open_map
 from visloc.evaluation import pose_error
 from visloc.features import make_local_features
-from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
 from visloc.localization.localizer import Localizer
 from visloc.options import Extraction, Inference, LocalizeOptions
+from visloc.photos.reading import read_photo_file
 from visloc.types import Localized
 
 _NETWORKS = ("r2d2", "faster2d2", "xfeat")

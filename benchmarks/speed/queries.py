@@ -14,10 +14,10 @@ from benchmarks.speed.machine import num_threads
 from visloc.archive import open_map
 from visloc.evaluation import pose_error
 from visloc.features import LocalFeatureExtractor, make_local_features
-from visloc.images import read_photo_file
 from visloc.kapture import Dataset, FileRecord, read_dataset
 from visloc.localization.localizer import Localizer
 from visloc.options import Extraction, Inference, LocalizeOptions
+from visloc.photos.reading import read_photo_file
 from visloc.types import Localized
 
 _ALL_KEYPOINTS = 10**6

@@ -16,11 +16,11 @@ from service.values import WorkerSettings, photo_job
 from visloc.archive import MapStore
 from visloc.errors import InvalidInput
 from visloc.features import LocalFeatureExtractor, make_global_descriptor, make_local_features
-from visloc.images import ImageLimits, Photo
 from visloc.localization.localizer import Localizer
 from visloc.localization.query.feature_cache import FeatureCache
 from visloc.localization.solving import SeenImage
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import ImageLimits, Photo
 from visloc.types import Answer, InstantAnswer
 
 OPTIONS = LocalizeOptions()

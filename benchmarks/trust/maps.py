@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from mapping.pipeline.build import build_map
-from mapping.pipeline.settings import BuildSettings
 from mapping.maps.sets import publish_set
 from mapping.methods.sfm_settings import SfmSettings
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from mapping.sample import write_sample
 from visloc.archive import MapStore
 from visloc.geometry import PixelOrigin, Similarity

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from visloc.errors import VislocError
 from visloc.evaluation import Threshold, pose_error
 from visloc.geometry import Camera, Pose
-from visloc.images import Photo
+from visloc.photos.reading import Photo
 from visloc.pose.centre import position_covariance
 from visloc.types import Answer, Evidence, InstantAnswer, Localized, RigPose
 

@@ -17,10 +17,10 @@ from benchmarks.trust.asking import OPTIONS, Maps
 from benchmarks.trust.maps import Places
 from benchmarks.trust.outcomes import Outcome, Query
 from visloc.geometry import Pose
-from visloc.images import read_photo_file
 from visloc.localization.acceptance.evidence import SeenView, compared_landmarks
 from visloc.localization.acceptance.gates import registration_for
 from visloc.localization.solving import SeenImage
+from visloc.photos.reading import read_photo_file
 
 _HEIGHT = 540
 _ALIKE, _DIFFERENT = (0, 200, 0), (255, 0, 0)

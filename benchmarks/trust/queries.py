@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from visloc.geometry import CAMERA_MODELS, Camera
-from visloc.images import Photo
+from visloc.photos.reading import Photo
 
 Pixels = NDArray[np.uint8]
 

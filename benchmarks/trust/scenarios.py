@@ -33,8 +33,8 @@ from benchmarks.trust.queries import (
 )
 from visloc.evaluation import Threshold
 from visloc.geometry import Camera, PixelOrigin, Pose
-from visloc.images import Photo, read_photo_file
 from visloc.kapture import Dataset, read_dataset
+from visloc.photos.reading import Photo, read_photo_file
 
 KITCHEN = "redkitchen"
 RIGHT = Threshold(0.5, 5.0)

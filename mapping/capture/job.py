@@ -11,9 +11,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from mapping.pipeline.build import build_map, refuse_existing_map
-from mapping.pipeline.pieces import refuse_long_id
-from mapping.pipeline.settings import BuildSettings
 from mapping.capture.frames import FilmedVideo, photo_name
 from mapping.capture.markers import find_markers, grey_photos
 from mapping.capture.placing import Yardstick, place
@@ -26,6 +23,9 @@ from mapping.cluster.workers import Workers
 from mapping.importers import ImportedModel, write_imported
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.pairing import PairSettings
+from mapping.pipeline.build import build_map, refuse_existing_map
+from mapping.pipeline.pieces import refuse_long_id
+from mapping.pipeline.settings import BuildSettings
 from mapping.progress import Progress, not_told
 from mapping.stages.networks import Networks
 from mapping.stages.photos import collect_photos

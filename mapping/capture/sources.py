@@ -19,10 +19,10 @@ from mapping.methods.sparse.intrinsics import FROM_EXIF
 from mapping.progress import Progress
 from mapping.stages.work_folder import WorkFolder
 from visloc.errors import DatasetError, VislocError, refuse
-from visloc.file_kinds import kind_of
 from visloc.geometry import Camera
 from visloc.kapture import GnssRecord, Sensor
 from visloc.kapture.dataset import UNKNOWN_CAMERA
+from visloc.photos.file_kinds import kind_of
 
 _EXPORT, _NERFSTUDIO = "transforms.json", "nerfstudio"
 _GNSS = "gnss"

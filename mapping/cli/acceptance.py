@@ -7,11 +7,11 @@ from typing import Annotated
 
 import typer
 
-from mapping.pipeline.pieces import use_version
 from mapping.cli.display import say
 from mapping.cluster.storage import open_store
 from mapping.options import CacheDirOption, PlacedMapsDirOption
 from mapping.own_test.picture import draw_doubts
+from mapping.pipeline.pieces import use_version
 from visloc.archive import Map
 from visloc.errors import refuse
 

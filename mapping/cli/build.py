@@ -9,8 +9,6 @@ from typing import Annotated
 
 import typer
 
-from mapping.pipeline.build import build_map
-from mapping.pipeline.settings import BuildSettings
 from mapping.cli.acceptance import require_acceptance
 from mapping.cli.display import (
     ERR,
@@ -40,6 +38,8 @@ from mapping.options import (
     WeightsDirOption,
     WorkersOption,
 )
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from visloc.archive import open_map
 from visloc.errors import refuse
 from visloc.features import DEFAULT_GLOBAL_FEATURES, DEFAULT_LOCAL_FEATURES

@@ -7,7 +7,6 @@ from typing import Annotated
 
 import typer
 
-from mapping.pipeline.pairs import PairsJob, write_pairs_of_dataset
 from mapping.cli.build import CovisibleInOption
 from mapping.cli.display import ERR, print_rig, say, say_notes, say_peak_memory
 from mapping.cli.progress import StageProgress
@@ -26,6 +25,7 @@ from mapping.options import (
     WeightsDirOption,
     names_in,
 )
+from mapping.pipeline.pairs import PairsJob, write_pairs_of_dataset
 from mapping.sample import write_sample
 from visloc.archive import open_map
 from visloc.errors import refuse

@@ -28,11 +28,11 @@ from mapping.report import make_report_data
 from mapping.report.data import UP_IS_A_GUESS, decimals_of
 from mapping.report.html import report_page
 from mapping.stages.work_folder import WorkFolder, exclusive
+from service.page import report_parts
 from visloc.archive import Map, open_map
 from visloc.drawing.detail_levels import detail_order
 from visloc.drawing.point_bytes import packed_points
 from visloc.errors import Conflict, VislocError, refuse
-from visloc_web import report_parts
 
 # Landmarks that the file carries: 3.2 MB, and as many as a picture of a screen can tell apart.
 MAX_POINTS = 150_000

@@ -21,7 +21,7 @@ from threadpoolctl import threadpool_limits
 from mapping.cluster.stage_timings import Spent, spent_here
 from mapping.progress import ItemProgress, Progress
 from visloc.errors import refuse
-from visloc.threads import threads, use_threads
+from visloc.runtime.threads import threads, use_threads
 
 S = TypeVar("S")
 T = TypeVar("T")

@@ -26,14 +26,14 @@ from numpy.typing import NDArray
 
 from mapping.films.tone import is_high_range, to_standard_range
 from visloc.errors import VislocError, refuse
-from visloc.file_kinds import HEAD_BYTES, file_kind, kind_of
-from visloc.images import ImageLimits
-from visloc.photo_formats import SUFFIXES as PHOTO_SUFFIXES
+from visloc.photos.file_kinds import HEAD_BYTES, file_kind, kind_of
+from visloc.photos.formats import SUFFIXES as PHOTO_SUFFIXES
+from visloc.photos.reading import ImageLimits
 
 SUFFIXES = (".mp4", ".m4v", ".mov", ".webm", ".mkv", ".3gp", ".3g2")
 SHARPNESS_SIDE = 960  # of the longer side: motion blur of a pixel or two is visible at this size
 _JPEG_QUALITY = 95
-# Demuxers by kind of file (visloc.file_kinds).
+# Demuxers by kind of file (visloc.photos.file_kinds).
 _DEMUXERS = {"MP4": "mov", "3GP": "mov", "MOV": "mov", "Matroska or WebM": "matroska"}
 _MAX_PIXELS = ImageLimits().max_pixels
 _PIXELS_OPTION = str(_MAX_PIXELS)
@@ -50,7 +50,7 @@ _LONGEST_LIVE_S = 5.0
 # Damaged packets are passed over up to this number in a row.
 _MAX_DAMAGED = 300
 _ISO6709 = re.compile(r"([+-]\d{2}(?:\.\d+)?)([+-]\d{3}(?:\.\d+)?)([+-]\d+(?:\.\d+)?)?")
-# CIPA DCG-001, as visloc.images: the 35 mm equivalent compares diagonals.
+# CIPA DCG-001, as visloc.photos.reading: the 35 mm equivalent compares diagonals.
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 # Of the longer side, as for EXIF: what lies outside was written by mistake.
 _PLAUSIBLE_FOCAL = (0.25, 50.0)

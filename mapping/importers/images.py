@@ -22,13 +22,13 @@ from mapping.importers.reading.photo_names import natural_order
 from mapping.importers.scans import refuse_scan
 from mapping.methods.sparse.intrinsics import FROM_EXIF
 from visloc.errors import InvalidInput, NotFound, TooLarge, VislocError, refuse
-from visloc.file_kinds import kind_of
 from visloc.geometry import Camera
-from visloc.images import FILE_LIMITS, Photo, exif_text, read_exif, read_photo
 from visloc.kapture import GnssRecord, Sensor
 from visloc.kapture.dataset import UNKNOWN_CAMERA
 from visloc.kapture.text import is_path_field
-from visloc.photo_formats import FORMATS, PNG_GREY, SUFFIXES, png_samples
+from visloc.photos.file_kinds import kind_of
+from visloc.photos.formats import FORMATS, PNG_GREY, SUFFIXES, png_samples
+from visloc.photos.reading import FILE_LIMITS, Photo, exif_text, read_exif, read_photo
 
 _GNSS = "gnss"
 # Some programs write words in place of the letters of EXIF.
@@ -48,7 +48,7 @@ _UNSTORABLE = (
 _LIVE = "films that a phone took around photos: the photos are used"
 _DEPTH, _FEW_LEVELS = "depth maps, grey of 16 bits", "masks or maps of confidence, not photos"
 _LEAST_LEVELS = 4  # of a grey PNG that is a photo
-# What Pillow raises on malformed EXIF beside giving none; found by fuzzing ``visloc.images``.
+# What Pillow raises on malformed EXIF beside giving none; found by fuzzing ``photos.reading``.
 _MALFORMED = (
     *(OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, AttributeError),
     *(EOFError, OverflowError, ZeroDivisionError, RuntimeError),

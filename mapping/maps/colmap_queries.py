@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from mapping.maps.colmap_database import DatabasePhoto
 from visloc.archive import Map
-from visloc.images import read_photo_file
 from visloc.kapture import Dataset, FileRecord
 from visloc.localization.localizer import Localizer
 from visloc.localization.solving import Look
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import read_photo_file
 
 # By pairs of rows, the lower one first.
 PairMatches = dict[tuple[int, int], NDArray[np.uint32]]

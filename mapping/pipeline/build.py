@@ -10,17 +10,6 @@ from pathlib import Path
 
 from pydantic import JsonValue
 
-from mapping.pipeline.checks import check_settings, refuse_early
-from mapping.pipeline.content import build_content
-from mapping.pipeline.pieces import (
-    WrittenMap,
-    ids_of_pieces,
-    note_of_largest,
-    note_of_piece,
-    publish_pieces,
-    refuse_long_id,
-)
-from mapping.pipeline.settings import BuildSettings
 from mapping.cluster.executors import Executor, open_executor
 from mapping.cluster.stage_timings import Costs
 from mapping.cluster.storage import (
@@ -39,6 +28,17 @@ from mapping.methods.sfm import landmarks_from_matches
 from mapping.own_test.given_poses import doubts_about_given
 from mapping.own_test.publishing import Examine, write_content
 from mapping.pairing import write_pairs
+from mapping.pipeline.checks import check_settings, refuse_early
+from mapping.pipeline.content import build_content
+from mapping.pipeline.pieces import (
+    WrittenMap,
+    ids_of_pieces,
+    note_of_largest,
+    note_of_piece,
+    publish_pieces,
+    refuse_long_id,
+)
+from mapping.pipeline.settings import BuildSettings
 from mapping.progress import Progress, one_step
 from mapping.stages.colours import landmark_colours
 from mapping.stages.context import BuildContext

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from mapping.pipeline.settings import METHODS, BuildSettings
 from mapping.cluster.executors import EXECUTORS
 from mapping.cluster.storage import is_remote, lies_in, work_place
 from mapping.frames.anchor import MAX_DIRECTION_ERROR_DEG, known_positions
@@ -18,6 +17,7 @@ from mapping.methods.sfm_settings import POSES
 from mapping.methods.sparse.adjustment import REFINABLE
 from mapping.methods.sparse.model import MAPPER_CONFIGS
 from mapping.pairing import PAIRINGS
+from mapping.pipeline.settings import METHODS, BuildSettings
 from mapping.stages.networks import Networks
 from mapping.stages.photos import MappingPhoto
 from visloc.errors import refuse

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.pipeline.settings import BuildSettings
 from mapping.methods.sfm import known_rigs
 from mapping.options import Vector
+from mapping.pipeline.settings import BuildSettings
 from mapping.stages.landmarks import MadeLandmarks
 from mapping.stages.local_features import LocalFeaturesSource
 from mapping.stages.photos import MappingPhoto

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 
 import mapping.pipeline.build  # noqa: F401  what tasks of a build need
-from visloc.preloading import load_torch_if_sure
+from visloc.localization.preloading import load_torch_if_sure
 
 load_torch_if_sure()
 # pycolmap would answer SIGTERM with a stack trace.

@@ -9,11 +9,11 @@ from typing import Annotated
 
 import typer
 
-from mapping.pipeline.checks import check_names
 from mapping.methods.scenes import find_pairs, make_scene
 from mapping.methods.sfm_settings import PairsOption, SfmSettings
 from mapping.options import DatasetArgument, FeaturesDirOption, Names, PixelOriginOption
 from mapping.pairing import PAIRINGS, POSED_PAIRINGS, PairSettings, write_pairs
+from mapping.pipeline.checks import check_names
 from mapping.progress import Progress, one_step
 from mapping.stages.global_features import read_global_features
 from mapping.stages.outputs import refuse_existing

@@ -25,8 +25,8 @@ from visloc.features.local.readymade import (
     to_global_descriptor,
 )
 from visloc.features.resolution import resized
-from visloc.images import turn_of, upright
 from visloc.kapture import Dataset, open_features
+from visloc.photos.reading import turn_of, upright
 from visloc.types import LocalFeatures
 
 T = TypeVar("T")

@@ -30,8 +30,8 @@ from visloc.features.local.readymade import (
 )
 from visloc.features.photo import extract_features
 from visloc.geometry import PixelOrigin
-from visloc.images import turn_of
 from visloc.kapture import FeatureSet, open_local_features, read_local
+from visloc.photos.reading import turn_of
 from visloc.types import Fingerprint, LocalFeatures
 
 # Raised when the code of the stage changes what comes out.

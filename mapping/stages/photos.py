@@ -11,9 +11,9 @@ from mapping.stages.depth import DepthMatch, DepthMatcher
 from visloc.archive import sha256_of
 from visloc.errors import refuse
 from visloc.geometry import Camera, Pose
-from visloc.images import FILE_LIMITS, Photo, read_photo_file, upright, with_mask
 from visloc.kapture import Dataset, FileRecord
 from visloc.localization.query.camera import GUESSED_FOCAL
+from visloc.photos.reading import FILE_LIMITS, Photo, read_photo_file, upright, with_mask
 
 # More names than a note needs.
 _NAMED = 3

@@ -39,6 +39,7 @@ from visloc.errors import (
 )
 from visloc.options import LocalizeOptions, ReadAs
 from visloc.priors import Priors
+from visloc.runtime.timing import summed
 from visloc.sets.choosing import (
     TileScore,
     allowed_tiles,
@@ -49,7 +50,6 @@ from visloc.sets.choosing import (
 )
 from visloc.sets.frame import answer_in_set, priors_in_tile, scaled_device
 from visloc.sets.unheard import hard_to_find, left_open
-from visloc.timing import summed
 from visloc.types import Near, Reason, Refusal
 
 # Codes of errors of reaching a map, not of the map itself, begin with one of these.

@@ -12,8 +12,8 @@ from pathlib import Path
 from fastapi import FastAPI, Request, Response
 
 from service.http.cache_headers import ASK_ALWAYS, FOR_EVER, is_current, not_modified, takes_gzip
+from service.page import page_folder
 from visloc.errors import Unavailable, refuse
-from visloc_web import page_folder
 
 logger = logging.getLogger(__name__)
 

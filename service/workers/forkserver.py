@@ -6,7 +6,7 @@ import gc
 import signal
 
 import service.workers.vision  # noqa: F401  loaded once, for all of them
-from visloc.preloading import load_torch_if_sure
+from visloc.localization.preloading import load_torch_if_sure
 
 load_torch_if_sure()
 

@@ -12,14 +12,14 @@ from visloc.archive import Map
 from visloc.archive.places import anchor_rms
 from visloc.errors import InvalidInput, refuse
 from visloc.geometry import Pose
-from visloc.images import Photo
-from visloc.localization.map_view.constraints import Constraints
 from visloc.localization.localizer import Localizer
+from visloc.localization.map_view.constraints import Constraints
 from visloc.localization.query.camera import MapCamera, resolve_camera
 from visloc.localization.solving import Look, SeenImage
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import Photo
 from visloc.priors import Priors
-from visloc.timing import summed
+from visloc.runtime.timing import summed
 from visloc.types import Evidence, InstantAnswer, QueryFeatures, Reason, Refusal, RigSensor
 
 _MAX_LISTED = 500  # characters of names from outside

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 from service.values import PackedQuery, Query
 from visloc.features import LocalFeatureExtractor
-from visloc.images import ImageLimits, Photo, read_photo, with_mask
 from visloc.localization.query.feature_cache import FeatureCache
-from visloc.timing import timed
+from visloc.photos.reading import ImageLimits, Photo, read_photo, with_mask
+from visloc.runtime.timing import timed
 from visloc.types import MaskedImage, QueryFeatures
 
 # Returns the extractor of local features with this name.

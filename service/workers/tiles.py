@@ -20,16 +20,16 @@ from visloc.features.local.readymade import (
     to_local_features,
 )
 from visloc.features.resolution import WorkingResolution
-from visloc.images import Photo
 from visloc.localization.map_view.constraints import MapGeometry
 from visloc.localization.query.camera import query_resolution, resolve_camera
 from visloc.localization.query.feature_cache import FeatureCache, find_features
 from visloc.localization.query.fingerprints import check_fingerprint
 from visloc.localization.turning import QUARTERS
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import Photo
+from visloc.runtime.timing import timed
 from visloc.sets.choosing import TileScore
 from visloc.sets.coarse import rank_tiles
-from visloc.timing import timed
 from visloc.types import LocalFeatures
 
 # Keypoints with the most effort. Maps have as many by default; a tile that was built with more

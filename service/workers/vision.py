@@ -47,16 +47,16 @@ from service.workers.photos import DecodedQuery, decode, pack
 from service.workers.sequences import SequenceRun
 from visloc.drawing.matches_picture import draw_overlay
 from visloc.errors import InvalidInput, VislocError
-from visloc.images import ImageLimits, Photo
-from visloc.localization.map_view.constraints import MapGeometry
 from visloc.localization.localizer import Localizer
+from visloc.localization.map_view.constraints import MapGeometry
 from visloc.localization.places import solve_photo
 from visloc.localization.solving import Look, SeenImage, Solved
 from visloc.localization.turning import is_worth_turning
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import ImageLimits, Photo
 from visloc.priors import Priors
-from visloc.threads import use_threads
-from visloc.timing import summed
+from visloc.runtime.threads import use_threads
+from visloc.runtime.timing import summed
 from visloc.types import InstantAnswer, Refusal
 
 logger = logging.getLogger(__name__)

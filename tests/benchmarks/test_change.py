@@ -16,8 +16,8 @@ from visloc.archive import MapStore
 from visloc.evaluation import Threshold
 from visloc.features import make_local_features
 from visloc.geometry import Camera, Pose
-from visloc.images import Photo
 from visloc.localization.localizer import Localizer
+from visloc.photos.reading import Photo
 
 CAMERA = Camera("PINHOLE", 132, 100, (110.0, 110.0, 66.0, 50.0))
 

@@ -17,8 +17,8 @@ from benchmarks.trust.table import write_tables
 from visloc.archive import MapStore
 from visloc.evaluation import Threshold
 from visloc.geometry import Pose
-from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
+from visloc.photos.reading import read_photo_file
 from visloc.types import InstantAnswer, PoseSource, RigPose, Uncertainty
 
 ASKED = Outcome("redkitchen", "redkitchen", "a.jpg", accepted=True, right=True)

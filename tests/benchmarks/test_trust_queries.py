@@ -18,7 +18,7 @@ from benchmarks.trust.queries import (
     with_print,
 )
 from visloc.geometry import Camera
-from visloc.images import Photo
+from visloc.photos.reading import Photo
 
 CAMERA = Camera("PINHOLE", 640, 480, (520.0, 530.0, 310.0, 250.0))
 SCENE = Camera("SIMPLE_PINHOLE", 1280, 960, (1100.0, 640.0, 480.0))

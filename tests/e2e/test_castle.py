@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mapping.methods.sfm_settings import SfmSettings
 from mapping.pipeline.build import build_map
 from mapping.pipeline.settings import BuildSettings
-from mapping.methods.sfm_settings import SfmSettings
 from visloc.archive import open_map
 from visloc.evaluation import pose_error
 from visloc.features import make_local_features
-from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
 from visloc.localization.localizer import Localizer
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import read_photo_file
 from visloc.types import Answer, Localized
 
 

@@ -11,15 +11,14 @@ import pytest
 from clients.evaluation.queries import Query
 from clients.evaluation.readers import FeatureReader
 from clients.evaluation.sent_matches import PhotoMatches
-from mapping.pipeline.build import build_map
-from mapping.pipeline.settings import BuildSettings
 from mapping.importers.hloc import import_features
 from mapping.methods.sfm_settings import SfmSettings
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from visloc.archive import open_map
 from visloc.evaluation import pose_error
 from visloc.features import make_local_features
 from visloc.geometry import PixelOrigin, Pose
-from visloc.images import read_photo_file
 from visloc.kapture import Dataset, open_local_features, read_dataset
 from visloc.kapture import write_local_features as write_kapture
 from visloc.kapture.matches import open_matches
@@ -27,6 +26,7 @@ from visloc.localization.localizer import Localizer
 from visloc.matching.correspondences import mutual_nearest_neighbours
 from visloc.matching.products import round_descriptors
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import read_photo_file
 from visloc.types import Localized
 
 h5py = pytest.importorskip("h5py", reason="h5py is not installed: the extra hloc")

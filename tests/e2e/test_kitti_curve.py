@@ -14,11 +14,11 @@ from visloc.archive import open_map
 from visloc.evaluation import pose_error
 from visloc.features import make_local_features
 from visloc.geometry import Pose
-from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
 from visloc.localization.localizer import Localizer
 from visloc.localization.solving import SeenImage
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import read_photo_file
 
 pytestmark = pytest.mark.slow  # building and looking take minutes
 

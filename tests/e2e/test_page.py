@@ -31,7 +31,7 @@ from visloc.geometry import Camera, Pose
 from visloc.options import Solver
 
 ROOT = Path(__file__).resolve().parents[2]
-BUILT = ROOT / "visloc_web" / "built"
+BUILT = ROOT / "service" / "page" / "built"
 LONGEST_S = 90
 
 

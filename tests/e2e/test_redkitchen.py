@@ -14,10 +14,10 @@ from mapping.pipeline.settings import BuildSettings
 from visloc.archive import open_map
 from visloc.evaluation import pose_error
 from visloc.features import make_local_features
-from visloc.images import Photo, read_photo_file
 from visloc.kapture import Dataset, read_dataset
 from visloc.localization.localizer import Localizer
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import Photo, read_photo_file
 from visloc.types import Localized, NotLocalized
 
 OPTIONS = LocalizeOptions()

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 # name -> module, class, and the modules whose branches guide the search.
 TARGETS: dict[str, tuple[str, str, tuple[str, ...]]] = {
-    "images": ("tests.fuzz.images", "Images", ("visloc.images", "PIL")),
+    "images": ("tests.fuzz.images", "Images", ("visloc.photos.reading", "PIL")),
     "archive": ("tests.fuzz.archive", "Archive", ("visloc.archive", "visloc.geometry", "zipfile")),
     "packed": ("tests.fuzz.packed", "Packed", ("visloc.archive", "zipfile")),
     "kapture": ("tests.fuzz.kapture", "Kapture", ("visloc.kapture", "visloc.geometry", "tarfile")),

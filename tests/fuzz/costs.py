@@ -40,7 +40,7 @@ from service.settings import ServiceSettings
 from tests.fuzz.images import Images
 from visloc.archive.packed import unpack_map
 from visloc.errors import InvalidInput, MapCorrupt
-from visloc.images import read_photo
+from visloc.photos.reading import read_photo
 from visloc_api.v1 import localization_pb2 as pb2
 from visloc_api.words.message import MAX_INSTANT_VALUES
 from visloc_api.words.photo import LocalizeRequest

@@ -15,7 +15,7 @@ from PIL import ExifTags, Image, PngImagePlugin
 from tests.fuzz.target import refusal
 from tests.heic import heic
 from visloc.errors import InvalidInput
-from visloc.images import ImageLimits, read_photo, stored_from_upright, upright
+from visloc.photos.reading import ImageLimits, read_photo, stored_from_upright, upright
 
 LIMITS = ImageLimits(max_bytes=2**16, max_pixels=2**18)
 

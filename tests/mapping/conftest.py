@@ -24,10 +24,10 @@ from visloc.archive import Map, MapStore
 from visloc.evaluation import pose_error
 from visloc.features import make_local_features
 from visloc.geometry import Camera, Pose
-from visloc.images import read_photo_file
 from visloc.kapture import read_dataset, write_dataset
 from visloc.localization.localizer import Localizer
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import read_photo_file
 from visloc.types import Localized
 
 

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from clients import Instant, RigImage
+from mapping.maps.sets import publish_set
 from mapping.pipeline.build import build_map
 from mapping.pipeline.settings import BuildSettings
-from mapping.maps.sets import publish_set
 from mapping.sample import write_sample
 from visloc.archive import MapStore
 from visloc.geometry import Similarity

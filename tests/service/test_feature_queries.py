@@ -24,7 +24,7 @@ from visloc.archive import Map, MapStore
 from visloc.features import make_global_descriptor, make_local_features
 from visloc.features.local.readymade import MAX_READY_MADE_KEYPOINTS
 from visloc.geometry import Camera, Pose, rotation_angle
-from visloc.images import read_photo
+from visloc.photos.reading import read_photo
 from visloc.types import QueryFeatures
 from visloc_api.v1 import localization_pb2 as pb2
 from visloc_api.words.features import Array

@@ -14,7 +14,7 @@ from PIL import Image
 from clients import Client, MaskedImage, RigImage
 from visloc.errors import InvalidInput
 from visloc.geometry import Pose
-from visloc.images import read_photo
+from visloc.photos.reading import read_photo
 from visloc.types import RigSensor
 from visloc_api.v1 import localization_pb2 as pb2
 

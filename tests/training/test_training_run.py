@@ -24,8 +24,8 @@ from training.validation import features_of, validate, validation_pairs
 from visloc.errors import InvalidInput
 from visloc.features.networks.r2d2.extractor import R2D2Extractor
 from visloc.features.networks.r2d2.load import load_faster2d2
-from visloc.images import read_photo_file
 from visloc.options import Inference
+from visloc.photos.reading import read_photo_file
 
 CPU = torch.device("cpu")
 SMOKE = PRESETS["smoke"]

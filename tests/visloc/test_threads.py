@@ -10,7 +10,7 @@ import cv2
 import pytest
 import torch
 
-from visloc.threads import count_of_threads, threads
+from visloc.runtime.threads import count_of_threads, threads
 
 
 def test_the_number_holds_for_all_libraries_within_the_block() -> None:
@@ -27,7 +27,7 @@ def test_the_number_holds_for_all_libraries_within_the_block() -> None:
 def test_torch_that_is_loaded_later_computes_with_as_many(inside: bool) -> None:
     code = f"""
 import os
-from visloc.threads import count_of_threads, threads, use_threads
+from visloc.runtime.threads import count_of_threads, threads, use_threads
 assert count_of_threads() == {min(2, len(os.sched_getaffinity(0)))}
 with threads(1):
     assert count_of_threads() == 1
@@ -46,6 +46,6 @@ assert torch.get_num_threads() == count_of_threads() == 1
 
 @pytest.mark.parametrize("said", ["", "0", "all", "-1"])
 def test_an_invalid_number_in_the_environment_is_ignored(said: str) -> None:
-    code = "from visloc.threads import count_of_threads; assert count_of_threads() >= 1"
+    code = "from visloc.runtime.threads import count_of_threads; assert count_of_threads() >= 1"
     environment = {"OMP_NUM_THREADS": said}
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120, env=environment)

@@ -16,9 +16,16 @@ from numpy.typing import NDArray
 from visloc.archive import Map
 from visloc.archive.schema import MAX_PHOTO_BYTES, MAX_PHOTO_SIDE
 from visloc.errors import InvalidInput, refuse
-from visloc.images import ImageLimits, Photo, read_photo, turn_of, upright, upright_from_stored
 from visloc.localization.solving import Look
 from visloc.options import ReadAs
+from visloc.photos.reading import (
+    ImageLimits,
+    Photo,
+    read_photo,
+    turn_of,
+    upright,
+    upright_from_stored,
+)
 from visloc.types import Answer, NotLocalized, Refusal, RigPose
 
 Canvas = NDArray[np.uint8]

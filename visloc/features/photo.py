@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from visloc.features import LocalFeatureExtractor
 from visloc.features.framing import AS_IT_IS, Framing, turned_picture, unturned_points
 from visloc.features.resolution import resized
-from visloc.images import Photo, stored_from_upright, turn_of, upright
 from visloc.options import Extraction, ReadAs
+from visloc.photos.reading import Photo, stored_from_upright, turn_of, upright
 from visloc.types import LocalFeatures
 
 # What turning by less than 90 degrees puts beside a picture makes keypoints along its edge.

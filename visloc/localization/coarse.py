@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from visloc.evaluation import CHI2_95_OF_3
 from visloc.features.framing import turned_points
 from visloc.geometry import Pose, covariance_from_center
-from visloc.images import turn_of, upright_from_stored
 from visloc.localization.map_view.constraints import Constraints, MapGeometry
 from visloc.options import ReadAs
+from visloc.photos.reading import turn_of, upright_from_stored
 from visloc.pose.average import average_pose, deviations
 from visloc.pose.centre import with_origin
 from visloc.retrieval.fusion import LateFusion

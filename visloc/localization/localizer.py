@@ -20,7 +20,6 @@ from visloc.features.framing import Framing
 from visloc.features.local.readymade import is_ready_made
 from visloc.features.networks.lightglue.load import make_lightglue
 from visloc.geometry import Camera
-from visloc.images import Photo
 from visloc.localization.acceptance.evidence import Shown
 from visloc.localization.acceptance.rivals import Proposed
 from visloc.localization.coarse import CoarsePoses
@@ -55,11 +54,12 @@ from visloc.matching.correspondences import (
 )
 from visloc.matching.products import round_descriptors, start_threads
 from visloc.options import Fallback, LocalizeOptions, Matcher, ReadAs
+from visloc.photos.reading import Photo
 from visloc.priors import NO_PRIORS, Priors
 from visloc.retrieval.excluded import excluded_photos
 from visloc.retrieval.fusion import LateFusion, chosen_fusion
 from visloc.retrieval.index import Retrieved, compare, retrieve
-from visloc.timing import timed
+from visloc.runtime.timing import timed
 from visloc.types import (
     Answer,
     CameraSource,

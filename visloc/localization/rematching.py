@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from visloc.features.framing import turned_points, turned_size
 from visloc.features.networks.lightglue.model import SeenKeypoints
 from visloc.geometry import Camera
-from visloc.images import turn_of, upright_from_stored
 from visloc.localization.map_view.constraints import MapGeometry
 from visloc.matching.correspondences import Pairs
 from visloc.options import ReadAs
+from visloc.photos.reading import turn_of, upright_from_stored
 from visloc.types import Evidence, LocalFeatures
 
 if TYPE_CHECKING:

@@ -29,7 +29,7 @@ from visloc.pose.centre import position_covariance, with_origin
 from visloc.pose.generalized import GeneralizedPose
 from visloc.pose.views import MatchedView
 from visloc.priors import Priors
-from visloc.timing import summed, timed
+from visloc.runtime.timing import summed, timed
 from visloc.types import (
     CameraSource,
     CoarsePose,

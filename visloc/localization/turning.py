@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from visloc.features import GlobalDescriptor, LocalFeatureExtractor
 from visloc.features.framing import Framing
-from visloc.images import Photo, turn_of, upright_from_stored
 from visloc.localization.map_view.constraints import Constraints, MapGeometry
 from visloc.localization.query.camera import query_resolution
 from visloc.localization.query.feature_cache import FeatureCache, find_features
 from visloc.matching.correspondences import CLEAR_RATIO, propose_landmarks
 from visloc.matching.products import round_descriptors
 from visloc.options import LocalizeOptions, ReadAs
+from visloc.photos.reading import Photo, turn_of, upright_from_stored
 from visloc.pose.gravity import KnownGravity
 from visloc.priors import Priors
 from visloc.retrieval.index import retrieve

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.device import has_cuda, torch_device
 from visloc.matching.nearest import Nearest, nearest
 from visloc.matching.on_device import nearest_on
 from visloc.matching.products import EightBitRows, in_threads
+from visloc.runtime.device import has_cuda, torch_device
 
 if TYPE_CHECKING:
     import torch

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.matching import compiled
-from visloc.threads import count_of_threads, loaded_torch
+from visloc.runtime.threads import count_of_threads, loaded_torch
 
 if TYPE_CHECKING:
     import torch

@@ -33,6 +33,7 @@ from visloc.options import LEAST_PROBABILITY, LocalizeOptions
 from visloc.pose.centre import with_origin
 from visloc.pose.motion import RelativeMotion, UncertainPose, link_from_motion
 from visloc.priors import Priors
+from visloc.runtime.timing import timed
 from visloc.sequences.filling import MAX_GAP_S, Odometry, TimeUnit, TracedPose, fill_sequence
 from visloc.sequences.odometry_readings import (
     ALL_READINGS,
@@ -42,7 +43,6 @@ from visloc.sequences.odometry_readings import (
     narrowed,
 )
 from visloc.sequences.window import WindowInstant, WindowPose, solve_window
-from visloc.timing import timed
 from visloc.types import InstantAnswer, PoseSource, Reason, Refusal, RigPose
 
 # At most this many instants wait, and as many answered ones are kept, whatever the gap: in a fast

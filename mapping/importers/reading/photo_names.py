@@ -11,9 +11,9 @@ from typing import TypeVar
 from PIL import Image
 
 from visloc.errors import InvalidInput, refuse
-from visloc.images import size_as_read
 from visloc.kapture.text import has_control_characters, is_field
-from visloc.photo_formats import PhotoHeader, open_header
+from visloc.photos.formats import PhotoHeader, open_header
+from visloc.photos.reading import size_as_read
 
 T = TypeVar("T")
 

@@ -44,8 +44,8 @@ from mapping.importers.scans.frames import (
 from mapping.stages.depth import read_depth
 from visloc.errors import refuse
 from visloc.geometry import MAX_IMAGE_SIDE, Camera
-from visloc.images import FILE_LIMITS
-from visloc.photo_formats import MALFORMED, png_samples
+from visloc.photos.formats import MALFORMED, png_samples
+from visloc.photos.reading import FILE_LIMITS
 
 _INTRINSICS, _SIZE = ("fx", "fy", "cx", "cy"), ("width", "height")
 

@@ -24,8 +24,8 @@ from mapping.importers.reading.tracks import has_moved, pose_from_center, rotati
 from mapping.stages.depth import DEFAULT_DEPTH_SCALE, MAX_DEPTH_PIXELS, read_depth
 from visloc.errors import DatasetError, InvalidInput, VislocError, refuse
 from visloc.geometry import Camera, Pose
-from visloc.images import read_photo_file
 from visloc.kapture import Sensor
+from visloc.photos.reading import read_photo_file
 
 # ARKit's camera looks along -z with y up.
 OURS_FROM_ARKIT = Pose(np.diag([1.0, -1.0, -1.0]), np.zeros(3))

@@ -19,8 +19,8 @@ from visloc.evaluation import Threshold, median_errors_localized, pose_error
 from visloc.features import GlobalDescriptor, LocalFeatureExtractor
 from visloc.geometry import Pose
 from visloc.kapture import read_dataset
-from visloc.localization.map_view.constraints import MapGeometry
 from visloc.localization.localizer import Localizer
+from visloc.localization.map_view.constraints import MapGeometry
 from visloc.localization.query.feature_cache import FeatureCache
 from visloc.options import LocalizeOptions
 from visloc.retrieval.index import retrieve

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.pipeline.pieces import without_pieces
 from mapping.cluster.storage import map_folder, storage_failed, work_place
 from mapping.cluster.workers import Workers
 from mapping.maps.editing import content_of, joined
@@ -50,6 +49,7 @@ from mapping.methods.sfm import landmarks_from_matches
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.own_test.given_poses import readings_of
 from mapping.own_test.publishing import publish_edited
+from mapping.pipeline.pieces import without_pieces
 from mapping.progress import Progress
 from mapping.stages.colours import landmark_colours
 from mapping.stages.context import BuildContext

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.pipeline.content import photo_content
 from mapping.maps.updating.capture import Capture
+from mapping.pipeline.content import photo_content
 from mapping.stages.landmarks import MadeLandmarks
 from mapping.stages.local_features import LocalFeaturesSource
 from visloc.archive import Landmarks, MapContent

@@ -10,8 +10,6 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from mapping.pipeline.pairs import PairsJob
-from mapping.pipeline.settings import BuildSettings
 from mapping.cli.build import ImportSettings
 from mapping.cli.from_settings import from_settings
 from mapping.cli.maps import AnchorSettings
@@ -21,6 +19,8 @@ from mapping.methods.rgbd import DepthSettings
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.options import Names, OnCommandLine
 from mapping.pairing import PairSettings
+from mapping.pipeline.pairs import PairsJob
+from mapping.pipeline.settings import BuildSettings
 from visloc.geometry import PixelOrigin
 from visloc.options import Fusion, Inference
 

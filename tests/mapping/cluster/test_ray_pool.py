@@ -17,12 +17,12 @@ from pathlib import Path
 import pytest
 from ray._raylet import Config
 
-from mapping.pipeline.build import build_map
-from mapping.pipeline.settings import BuildSettings
 from mapping.cluster import ray_pool
 from mapping.cluster.executors import open_executor
 from mapping.cluster.ray_pool import RayPool
 from mapping.cluster.storage import place_of
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from visloc.archive import Map, open_map
 from visloc.errors import InvalidInput, Unavailable
 

@@ -11,10 +11,10 @@ import fsspec
 import numpy as np
 import pytest
 
-from mapping.pipeline.build import build_map
-from mapping.pipeline.settings import BuildSettings
 from mapping.cli.acceptance import use
 from mapping.cluster.storage import is_remote, open_store, opened_dataset, place_of, storage_failed
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from mapping.stages.work_folder import WorkFolder, key_of
 from visloc.archive import Map, open_map
 from visloc.errors import DatasetError, InvalidInput, Unavailable

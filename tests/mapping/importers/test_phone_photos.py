@@ -21,10 +21,10 @@ from visloc.archive import MapStore
 from visloc.evaluation import pose_error
 from visloc.features import make_local_features
 from visloc.geometry import Camera
-from visloc.images import read_photo, upright
 from visloc.kapture import read_dataset
 from visloc.localization.localizer import Localizer
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import read_photo, upright
 from visloc.types import CameraSource, Localized
 
 Pixels = NDArray[np.uint8]

@@ -24,8 +24,8 @@ from samples.film import encode_video
 from tests.mapping.capture.test_video import turned
 from visloc.errors import DatasetError, InvalidInput, VislocError
 from visloc.geometry import Camera, Pose
-from visloc.images import read_photo_file
 from visloc.kapture import Dataset, FileRecord, read_dataset
+from visloc.photos.reading import read_photo_file
 
 _UPRIGHT = (0, 1, -1, 0)  # the display matrix of a phone held upright
 ARKIT = np.diag([1.0, -1.0, -1.0, 1.0])

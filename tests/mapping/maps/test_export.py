@@ -10,11 +10,11 @@ import pycolmap
 import pytest
 from numpy.typing import NDArray
 
-from mapping.pipeline.build import build_map
-from mapping.pipeline.settings import BuildSettings
 from mapping.importers import import_dataset
 from mapping.maps.editing import content_of
 from mapping.maps.export import EXPORTERS, export_map
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from visloc.archive import (
     FingerprintRecord,
     GlobalFeatures,

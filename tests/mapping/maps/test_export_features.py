@@ -12,9 +12,9 @@ from mapping.maps.export_features import export_features
 from visloc.archive import MapStore
 from visloc.errors import Conflict
 from visloc.features import make_global_descriptor, make_local_features
-from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
 from visloc.options import Inference
+from visloc.photos.reading import read_photo_file
 
 SIFT_DIM = 128
 

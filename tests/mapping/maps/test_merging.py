@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
-from mapping.pipeline.build import build_map
-from mapping.pipeline.settings import BuildSettings
 from mapping.cli.main import app
 from mapping.maps.editing import content_of, moved, selected
 from mapping.maps.merging import join_as_set, merge_maps
 from mapping.own_test.publishing import publish_edited
 from mapping.own_test.trials import own_test
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from mapping.sample import write_sample
 from mapping.stages.work_folder import exclusive
 from visloc.archive import Anchor, Geodetic, Map, MapStore, SetOutline

@@ -14,8 +14,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mapping.pipeline.build import build_map
-from mapping.pipeline.settings import BuildSettings
 from mapping.cli import main as cli
 from mapping.frames.set_poses import poses_on_earth, read_poses
 from mapping.maps.editing import content_of, moved
@@ -23,6 +21,8 @@ from mapping.maps.sets import publish_set
 from mapping.maps.splitting import cut, split_map
 from mapping.own_test.publishing import publish_edited
 from mapping.own_test.verdict import misses_own_photos
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from mapping.sample import write_sample
 from visloc.archive import Anchor, Geodetic, Map, MapStore, SetOutline
 from visloc.archive.places import enu_of
@@ -31,13 +31,13 @@ from visloc.evaluation import pose_error
 from visloc.features import make_local_features
 from visloc.geodesy import geodetic_from_enu
 from visloc.geometry import Pose, Similarity
-from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
 from visloc.localization.acceptance.judge import TIE_REACH_SHARE, PlaceAnswer, Tie, judge
-from visloc.localization.map_view.constraints import Constraints, MapGeometry
 from visloc.localization.localizer import Localizer
+from visloc.localization.map_view.constraints import Constraints, MapGeometry
 from visloc.localization.solving import SeenImage
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import read_photo_file
 from visloc.priors import NO_PRIORS, HeightBand, PositionPrior, Priors
 from visloc.sets.choosing import allowed_tiles, plan
 from visloc.sets.coarse import rank_tiles

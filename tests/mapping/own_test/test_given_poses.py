@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapping.pipeline.build import build_map
-from mapping.pipeline.settings import BuildSettings
 from mapping.own_test import given_poses
 from mapping.own_test.given_poses import _distances, _factor, _is_along_ray, _Pair, _Written
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from mapping.stages.photos import MappingPhoto
 from samples.trajectories import mapping_trajectory
 from visloc.archive import MapStore

@@ -11,8 +11,6 @@ import cv2
 import numpy as np
 import pytest
 
-from mapping.pipeline.build import build_map
-from mapping.pipeline.settings import BuildSettings
 from mapping.cli.acceptance import require_acceptance, use
 from mapping.maps.editing import content_of
 from mapping.maps.merging import merge_maps
@@ -20,6 +18,8 @@ from mapping.maps.splitting import split_map
 from mapping.own_test.publishing import publish_edited
 from mapping.own_test.trials import OwnTestRun, run_own_test
 from mapping.own_test.verdict import doubts_about, misses_own_photos
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from visloc.archive import Map, MapStore, OwnTest, open_map
 from visloc.archive.schema import Doubt
 from visloc.errors import Conflict, InvalidInput, NotFound

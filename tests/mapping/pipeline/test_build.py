@@ -16,12 +16,12 @@ import pytest
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
-import mapping.pipeline.build
 import mapping.own_test.publishing
-from mapping.pipeline.build import build_map
-from mapping.pipeline.settings import BuildSettings
+import mapping.pipeline.build
 from mapping.cluster.workers import Workers
 from mapping.methods.rgbd import DepthSettings
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from mapping.stages.networks import Networks
 from mapping.stages.work_folder import exclusive
 from visloc.archive import Map, MapStore, verify_map, write_map
@@ -38,10 +38,10 @@ from visloc.features import make_local_features
 from visloc.features.backends.choice import choose_inference
 from visloc.features.local.sift import SiftExtractor
 from visloc.geometry import Camera, Pose
-from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
 from visloc.localization.localizer import Localizer
 from visloc.options import Inference, LocalizeOptions
+from visloc.photos.reading import read_photo_file
 from visloc.types import Localized
 
 Damage = Callable[[Path], None]

@@ -20,7 +20,6 @@ from visloc.errors import DatasetError, InvalidInput
 from visloc.evaluation import pose_error
 from visloc.features import make_local_features
 from visloc.geometry import Camera, PixelOrigin, Pose
-from visloc.images import read_photo_file
 from visloc.kapture import (
     open_features,
     open_local_features,
@@ -34,6 +33,7 @@ from visloc.localization.localizer import Localizer
 from visloc.matching.correspondences import mutual_nearest_neighbours
 from visloc.matching.products import round_descriptors
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import read_photo_file
 from visloc.pose.colmap import project
 from visloc.types import LocalFeatures, Localized, QueryFeatures
 

@@ -15,7 +15,6 @@ from visloc.errors import DatasetError, InvalidInput, VislocError
 from visloc.evaluation import pose_error
 from visloc.features import make_local_features
 from visloc.geometry import Camera, PixelOrigin, Pose
-from visloc.images import read_photo_file
 from visloc.kapture import (
     open_features,
     open_local_features,
@@ -26,6 +25,7 @@ from visloc.kapture import (
 )
 from visloc.localization.localizer import Localizer
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import read_photo_file
 from visloc.types import LocalFeatures, Localized, QueryFeatures
 
 Build = Callable[..., Map]

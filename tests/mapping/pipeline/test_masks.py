@@ -15,8 +15,8 @@ from mapping.stages.photos import read_in_frame
 from tests.turning import store_photo_turned
 from visloc.archive import Map, open_map
 from visloc.errors import DatasetError, InvalidInput, TooLarge
-from visloc.images import FILE_LIMITS, read_photo_file, upright, with_mask
 from visloc.kapture import read_dataset
+from visloc.photos.reading import FILE_LIMITS, read_photo_file, upright, with_mask
 
 
 def build(dataset: Path, maps: Path, **settings: Any) -> Map:

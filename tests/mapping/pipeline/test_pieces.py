@@ -11,6 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mapping.frames.anchor import align_poses
+from mapping.maps.editing import content_of
+from mapping.methods.sfm_settings import SfmSettings
+from mapping.own_test.publishing import write_content
 from mapping.pipeline.build import build_map
 from mapping.pipeline.pieces import (
     WrittenMap,
@@ -22,20 +26,16 @@ from mapping.pipeline.pieces import (
     without_pieces,
 )
 from mapping.pipeline.settings import BuildSettings
-from mapping.frames.anchor import align_poses
-from mapping.maps.editing import content_of
-from mapping.methods.sfm_settings import SfmSettings
-from mapping.own_test.publishing import write_content
 from mapping.sample import write_sample
 from visloc.archive import Map, MapStore, open_map
 from visloc.archive.schema import PIECES, Doubt
 from visloc.errors import Conflict, InvalidInput, NotFound
 from visloc.features import make_local_features
 from visloc.geometry import Pose
-from visloc.images import read_photo_file
 from visloc.kapture import FileRecord, read_dataset, write_dataset
 from visloc.localization.localizer import Localizer
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import read_photo_file
 from visloc.types import Localized
 
 # Photos of the first and of the second room.

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from benchmarks.retrieval import shared_landmarks
+from mapping.methods.sfm_settings import SfmSettings
 from mapping.pipeline.build import build_map
 from mapping.pipeline.settings import BuildSettings
-from mapping.methods.sfm_settings import SfmSettings
 from visloc.archive import open_map
 from visloc.evaluation import pose_error
 from visloc.geometry import Camera, PixelOrigin, Pose

@@ -12,8 +12,6 @@ import pytest
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
-from mapping.pipeline.build import build_map
-from mapping.pipeline.settings import BuildSettings
 from mapping.cli.main import app
 from mapping.cli.report import write_report
 from mapping.maps.export import EXPORTERS, export_map
@@ -22,17 +20,19 @@ from mapping.maps.pruning import prune_map
 from mapping.maps.sets import publish_set
 from mapping.maps.splitting import split_map
 from mapping.maps.updating import UpdateSettings, update_map
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from visloc.archive import Map, MapStore, open_map, open_set, verify_map
 from visloc.drawing.detail_levels import detail_order, read_landmarks
 from visloc.drawing.point_bytes import HEADER_BYTES, read_points
 from visloc.errors import Conflict, InvalidInput
 from visloc.features import make_local_features
 from visloc.geometry import Similarity
-from visloc.images import Photo, read_photo_file
 from visloc.kapture import read_dataset, write_dataset
-from visloc.localization.map_view.constraints import MapGeometry
 from visloc.localization.localizer import Localizer
+from visloc.localization.map_view.constraints import MapGeometry
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import Photo, read_photo_file
 from visloc.types import Localized, Uncertainty
 
 

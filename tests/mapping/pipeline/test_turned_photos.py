@@ -12,10 +12,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mapping.pipeline.build import build_map
-from mapping.pipeline.settings import BuildSettings
 from mapping.maps.export_features import export_features
 from mapping.maps.updating import UpdateSettings, update_map
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from mapping.stages.photos import read_in_frame
 from tests.turning import (
     png,
@@ -32,10 +32,10 @@ from visloc.evaluation import pose_error
 from visloc.features import make_local_features
 from visloc.features.photo import extract_features
 from visloc.geometry import Camera, PixelOrigin, Pose
-from visloc.images import read_photo, read_photo_file, turn_of
 from visloc.kapture import open_local_features, read_dataset, read_local
 from visloc.localization.localizer import Localizer
 from visloc.options import Inference, LocalizeOptions, ReadAs
+from visloc.photos.reading import read_photo, read_photo_file, turn_of
 from visloc.types import Localized
 
 SIZE = (256, 192)

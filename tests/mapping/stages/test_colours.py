@@ -12,11 +12,11 @@ import pytest
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
-from mapping.pipeline.build import build_map
-from mapping.pipeline.settings import BuildSettings
 from mapping.cli.main import app
 from mapping.cluster.workers import Workers
 from mapping.maps.export import export_map
+from mapping.pipeline.build import build_map
+from mapping.pipeline.settings import BuildSettings
 from mapping.stages.colours import landmark_colours
 from mapping.stages.context import BuildContext
 from mapping.stages.local_features import ExtractedFeatures
@@ -26,9 +26,9 @@ from mapping.stages.work_folder import WorkFolder
 from visloc.archive import Landmarks, Map, MapStore, sha256_of, verify_map
 from visloc.errors import DatasetError
 from visloc.geometry import Camera, Pose
-from visloc.images import read_photo_file
 from visloc.kapture import FileRecord, read_dataset
 from visloc.options import Inference
+from visloc.photos.reading import read_photo_file
 
 Build = Callable[..., Map]
 RED, GREEN, BLUE, GREY = (250, 10, 20), (0, 200, 100), (30, 40, 255), (77, 77, 77)

@@ -23,9 +23,9 @@ from mapping.stages.work_folder import WorkFolder
 from visloc.archive import GlobalFeatures, Map
 from visloc.errors import Unavailable
 from visloc.features import GLOBAL_FEATURES, ImageDescriptor
-from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
 from visloc.options import Inference
+from visloc.photos.reading import read_photo_file
 from visloc.types import Fingerprint
 
 WEIGHTS = Path("weights")

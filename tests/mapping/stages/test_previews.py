@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
+from mapping.cluster.workers import Workers
 from mapping.pipeline.build import build_map
 from mapping.pipeline.settings import BuildSettings
-from mapping.cluster.workers import Workers
 from mapping.stages.context import BuildContext
 from mapping.stages.local_features import ExtractedFeatures
 from mapping.stages.networks import Networks
@@ -22,9 +22,9 @@ from mapping.stages.work_folder import WorkFolder
 from visloc.archive import Map, MapStore, open_map, verify_map
 from visloc.errors import MapCorrupt
 from visloc.geometry import Camera
-from visloc.images import read_photo, read_photo_file
 from visloc.kapture import FileRecord
 from visloc.options import Inference
+from visloc.photos.reading import read_photo, read_photo_file
 
 NO_NETWORKS = Networks(None, Inference.AUTO)
 NO_FEATURES = cast("ExtractedFeatures", None)  # pictures need none

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from tests.service.engine.engines import WithEngine, started
-from visloc.images import ImageLimits
+from visloc.photos.reading import ImageLimits
 
 
 @pytest.fixture(scope="module")

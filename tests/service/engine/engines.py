@@ -19,8 +19,8 @@ from service.values import RigJob, WorkerSettings, photo_job
 from service.workers.tasks import Vision
 from visloc.archive import MapStore
 from visloc.geometry import Camera
-from visloc.images import ImageLimits
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import ImageLimits
 
 T = TypeVar("T")
 

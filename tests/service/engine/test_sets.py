@@ -32,8 +32,8 @@ from visloc.archive.packed import pack_map
 from visloc.errors import Conflict, InvalidInput, NotFound, Unavailable
 from visloc.features import make_global_descriptor, make_local_features
 from visloc.geometry import Pose, Similarity, rotation_angle
-from visloc.images import read_photo
 from visloc.kapture import read_dataset
+from visloc.photos.reading import read_photo
 from visloc.priors import PosePrior, PositionPrior, Priors
 
 Serve = Callable[..., AbstractContextManager[Any]]

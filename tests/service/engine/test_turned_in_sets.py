@@ -27,8 +27,8 @@ from tests.turning import png, turned_camera, turned_pixels, turned_pose
 from visloc.archive import MapStore
 from visloc.evaluation import pose_error
 from visloc.geometry import Camera, Pose, Similarity
-from visloc.images import read_photo
 from visloc.options import Inference, LocalizeOptions, ReadAs
+from visloc.photos.reading import read_photo
 from visloc.types import Reason, Refusal
 
 # Orientations of EXIF that a camera turned by quarters would have written, by clockwise degrees

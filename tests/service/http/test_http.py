@@ -34,7 +34,7 @@ from service.values import RigJob
 from tests.heic import heic
 from tests.turning import png, turned_camera, turned_pixels, turned_pose
 from visloc.geometry import Pose, rotation_angle
-from visloc.images import read_photo
+from visloc.photos.reading import read_photo
 from visloc_api.v1 import localization_pb2 as pb2
 from visloc_api.words import answers, maps, scenes, status
 

@@ -15,9 +15,9 @@ from tests.turning import png, turned_camera, turned_pixels, turned_pose
 from visloc.archive import MapStore
 from visloc.evaluation import pose_error
 from visloc.geometry import Camera, Pose
-from visloc.images import read_photo
 from visloc.localization.turning import TurnFinder
 from visloc.options import Inference, LocalizeOptions, ReadAs
+from visloc.photos.reading import read_photo
 
 SETTINGS = WorkerSettings(None, 1, 10**9, 8, 8, 10**8, 10**8, Inference.FP32)
 

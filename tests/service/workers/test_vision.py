@@ -33,7 +33,7 @@ from visloc.errors import Conflict, InvalidInput, NotFound, WeightsError
 from visloc.features import GlobalDescriptor, make_global_descriptor
 from visloc.options import Inference, LocalizeOptions, Matcher, Solver
 from visloc.priors import NO_PRIORS
-from visloc.threads import count_of_threads, threads
+from visloc.runtime.threads import count_of_threads, threads
 from visloc.types import QueryFeatures
 
 WEIGHTS = Path("weights")

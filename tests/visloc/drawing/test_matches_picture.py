@@ -14,10 +14,10 @@ from visloc.drawing.matches_picture import draw_overlay
 from visloc.errors import MapCorrupt
 from visloc.features import make_local_features
 from visloc.geometry import Camera
-from visloc.images import Photo, read_photo
 from visloc.localization.localizer import Localizer
 from visloc.localization.solving import Look, Matches
 from visloc.options import LocalizeOptions, ReadAs
+from visloc.photos.reading import Photo, read_photo
 from visloc.types import CameraSource, Evidence, Localized, NotLocalized, Reason, RetrievedImage
 
 OPTIONS = LocalizeOptions()

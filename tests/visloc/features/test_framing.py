@@ -13,7 +13,7 @@ from visloc.features.framing import (
 )
 from visloc.features.local.sift import SiftExtractor
 from visloc.features.photo import extract_features
-from visloc.images import Photo
+from visloc.photos.reading import Photo
 
 WIDTH, HEIGHT = 90, 60
 # The middle of each dot, in pixels from the corner of the picture.

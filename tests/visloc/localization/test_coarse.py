@@ -13,10 +13,10 @@ from visloc.archive import MapStore
 from visloc.evaluation import CHI2_95_OF_3, pose_error
 from visloc.features import make_local_features
 from visloc.geometry import Camera, Pose, center_covariance
-from visloc.images import read_photo
 from visloc.localization.coarse import _Widening
 from visloc.localization.localizer import Localizer
 from visloc.options import Fallback, LocalizeOptions, ReadAs
+from visloc.photos.reading import read_photo
 from visloc.priors import NO_PRIORS, PositionPrior, Priors
 from visloc.types import CoarsePose, Localized, NotLocalized
 

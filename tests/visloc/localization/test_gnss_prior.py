@@ -13,10 +13,10 @@ from visloc.archive.places import enu_of, origin_of
 from visloc.errors import InvalidInput
 from visloc.features import make_local_features
 from visloc.geodesy import geodetic_from_enu
-from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
 from visloc.localization.localizer import Localizer
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import read_photo_file
 from visloc.priors import GnssPrior, Priors
 from visloc.types import Answer, Localized, NotLocalized, Reason
 

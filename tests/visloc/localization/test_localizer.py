@@ -21,11 +21,11 @@ from visloc.features import (
 )
 from visloc.features.local.sift import SiftExtractor
 from visloc.geometry import Camera, Pose
-from visloc.images import Photo, read_photo
 from visloc.localization.localizer import Localizer
 from visloc.localization.query.camera import resolve_camera
 from visloc.localization.query.features import max_sent_keypoints
 from visloc.options import LocalizeOptions, ReadAs
+from visloc.photos.reading import Photo, read_photo
 from visloc.types import (
     Answer,
     CameraSource,

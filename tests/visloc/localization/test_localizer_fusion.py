@@ -16,9 +16,9 @@ from visloc.archive.schema import RetrievalRecord
 from visloc.errors import InvalidInput
 from visloc.features import GlobalDescriptor, make_global_descriptor, make_local_features
 from visloc.geometry import Camera, Pose
-from visloc.images import Photo, read_photo
 from visloc.localization.localizer import Localizer
 from visloc.options import Fusion, LocalizeOptions
+from visloc.photos.reading import Photo, read_photo
 from visloc.priors import PositionPrior, Priors
 from visloc.types import Answer, LocalFeatures, Localized, QueryFeatures, Reason, RetrievedImage
 

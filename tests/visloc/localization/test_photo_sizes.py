@@ -15,10 +15,10 @@ from visloc.archive import MapStore
 from visloc.evaluation import pose_error
 from visloc.features import make_global_descriptor, make_local_features
 from visloc.geometry import Camera, Pose
-from visloc.images import Photo, read_photo
 from visloc.localization.localizer import Localizer
 from visloc.localization.solving import SeenImage
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import Photo, read_photo
 from visloc.types import Answer, CameraSource, Localized, QueryFeatures
 
 OPTIONS = LocalizeOptions()

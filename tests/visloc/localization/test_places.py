@@ -14,13 +14,13 @@ from visloc.archive import MapStore
 from visloc.evaluation import pose_error
 from visloc.features import make_local_features
 from visloc.geometry import Camera, Pose
-from visloc.images import read_photo
 from visloc.localization.acceptance.rivals import Proposed
 from visloc.localization.localizer import Localizer
 from visloc.localization.places import look_at_one_place, solve_photo
 from visloc.localization.solving import Look, Matches, SeenImage, Solved
 from visloc.matching.correspondences import Proposals
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import read_photo
 from visloc.pose.centre import moved_origin
 from visloc.priors import NO_PRIORS, PositionPrior, Priors
 from visloc.types import CameraSource, Reason

@@ -14,11 +14,11 @@ from visloc.evaluation import pose_error
 from visloc.features import make_local_features
 from visloc.features.networks.lightglue.model import SeenKeypoints
 from visloc.geometry import Camera, Pose
-from visloc.images import Photo, read_photo
 from visloc.localization.localizer import Localizer
 from visloc.matching.correspondences import NUM_REMATCHED, mutual_nearest_neighbours
 from visloc.matching.products import round_descriptors
 from visloc.options import LocalizeOptions, Matcher
+from visloc.photos.reading import Photo, read_photo
 from visloc.types import Localized
 
 LIGHTGLUE = LocalizeOptions(matcher=Matcher.LIGHTGLUE)

@@ -16,10 +16,10 @@ from visloc.archive import MapStore
 from visloc.evaluation import pose_error
 from visloc.features import make_local_features
 from visloc.geometry import Camera, Pose
-from visloc.images import Photo, read_photo
 from visloc.localization.localizer import Localizer
 from visloc.localization.turning import TurnFinder, turn_that_promises
 from visloc.options import LocalizeOptions, ReadAs
+from visloc.photos.reading import Photo, read_photo
 from visloc.priors import GravityPrior, Priors
 from visloc.types import Answer, Localized, NotLocalized
 

@@ -14,8 +14,8 @@ from visloc.archive.index_files import check_lists
 from visloc.archive.sets import MapSet
 from visloc.errors import Conflict, MapCorrupt
 from visloc.features import make_local_features
-from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
+from visloc.photos.reading import read_photo_file
 from visloc.retrieval.inverted import MadeLists
 from visloc.sets.coarse import (
     CoarseModel,

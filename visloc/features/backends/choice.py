@@ -6,10 +6,10 @@ import logging
 from functools import cache
 from pathlib import Path
 
-from visloc.device import has_cuda, may_have_cuda
 from visloc.errors import refuse
 from visloc.features.backends.openvino import import_openvino
 from visloc.options import Inference
+from visloc.runtime.device import has_cuda, may_have_cuda
 
 _LOGGER = logging.getLogger(__name__)
 _CPU_INFO = Path("/proc/cpuinfo")

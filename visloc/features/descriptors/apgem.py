@@ -18,7 +18,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from visloc.device import torch_device
 from visloc.errors import refuse
 from visloc.features.base import GlobalDescriptor
 from visloc.features.descriptors.network_descriptor import (
@@ -36,6 +35,7 @@ from visloc.features.weights.checkpoint import Checkpoint
 from visloc.features.weights.files import PublishedWeights, check_shapes, read_weights
 from visloc.features.weights.pickled_pca import PrincipalComponents, principal_components
 from visloc.options import Inference
+from visloc.runtime.device import torch_device
 
 DEPTH = 101
 # The authors describe photos as large as they are; their time grows with the pixels, and 1024 is

@@ -22,7 +22,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from visloc.device import torch_device
 from visloc.features.base import GlobalDescriptor
 from visloc.features.descriptors.network_descriptor import (
     NetworkDescriptor,
@@ -38,6 +37,7 @@ from visloc.features.networks.resnet import FEATURES, Layout, ResNet, depth_of, 
 from visloc.features.weights.checkpoint import Checkpoint
 from visloc.features.weights.files import PublishedWeights, check_shapes, read_weights
 from visloc.options import Inference
+from visloc.runtime.device import torch_device
 
 SCALES = (1 / sqrt(2), 1.0, sqrt(2))
 MAX_LONG_SIDE_PX = 1024  # at scale 1, as the authors' configuration has it

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from visloc.device import has_cuda, torch_device
 from visloc.features.base import Fingerprint, GlobalDescriptor
 from visloc.features.descriptors.dense_grid import (
     CELL_PX,
@@ -27,6 +26,7 @@ from visloc.features.descriptors.dense_grid import (
 )
 from visloc.features.descriptors.vlad import VLAD_PARAMETERS, VladDescriptor, vlad_of_sums
 from visloc.options import Inference
+from visloc.runtime.device import has_cuda, torch_device
 from visloc.types import LocalFeatures
 
 if TYPE_CHECKING:

@@ -25,7 +25,6 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from visloc.device import torch_device
 from visloc.features.backends.convolution import Convolution
 from visloc.features.backends.torch import torch_convolution
 from visloc.features.base import GlobalDescriptor
@@ -39,6 +38,7 @@ from visloc.features.descriptors.whitening import unit_rows
 from visloc.features.weights.checkpoint import Checkpoint
 from visloc.features.weights.files import PublishedWeights, check_shapes, read_weights
 from visloc.options import Inference
+from visloc.runtime.device import torch_device
 
 CLUSTERS = 64
 # Widths of the 3 x 3 convolutions, up to each halving of the resolution.

@@ -11,7 +11,7 @@ from visloc.archive import Map
 from visloc.errors import refuse
 from visloc.features.resolution import Resolution
 from visloc.geometry import Camera
-from visloc.images import Photo
+from visloc.photos.reading import Photo
 from visloc.types import CameraSource
 
 # Focal length in units of the longer side when nothing is known: a view of 45 degrees, between a

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from visloc.features import LocalFeatureExtractor
 from visloc.features.framing import AS_IT_IS, Framing
 from visloc.features.photo import extract_features, where_counting
-from visloc.images import Photo
 from visloc.options import Extraction, LocalizeOptions, ReadAs
+from visloc.photos.reading import Photo
 from visloc.types import LocalFeatures
 
 # Most keypoints of a query, strongest first. ACCURATE uses as many as the mapping images.

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from visloc.archive import MapStore
 from visloc.features import make_local_features
 from visloc.geometry import Camera, Pose
-from visloc.images import Photo, read_photo
 from visloc.localization.acceptance.evidence import (
     FEATURES,
     SeenView,
@@ -23,10 +22,11 @@ from visloc.localization.acceptance.evidence import (
 )
 from visloc.localization.acceptance.gates import Problem, likely
 from visloc.localization.acceptance.probability import read_model, shipped_model
-from visloc.localization.map_view.constraints import Constraints
 from visloc.localization.localizer import Localizer
+from visloc.localization.map_view.constraints import Constraints
 from visloc.matching.products import EightBitRows
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import Photo, read_photo
 from visloc.pose.colmap import project
 from visloc.pose.generalized import GeneralizedPose
 from visloc.pose.views import MatchedView

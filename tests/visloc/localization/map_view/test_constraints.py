@@ -16,8 +16,8 @@ from visloc.archive.schema import Parts
 from visloc.errors import InvalidInput
 from visloc.evaluation import pose_error
 from visloc.geometry import Camera, Pose, Similarity, covariance_from_center
-from visloc.localization.map_view.constraints import Constraints, MapGeometry
 from visloc.localization.localizer import Localizer
+from visloc.localization.map_view.constraints import Constraints, MapGeometry
 from visloc.options import LocalizeOptions
 from visloc.pose.colmap import normalized_rays, project
 from visloc.pose.views import MatchedView

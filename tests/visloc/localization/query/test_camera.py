@@ -12,8 +12,8 @@ import pytest
 
 from visloc.archive import Map
 from visloc.geometry import Camera
-from visloc.images import Photo
 from visloc.localization.query.camera import MapCamera, map_cameras, resolve_camera
+from visloc.photos.reading import Photo
 from visloc.types import CameraSource
 
 LENS = Camera("SIMPLE_RADIAL", 400, 300, (330.0, 201.0, 149.0, -0.1))

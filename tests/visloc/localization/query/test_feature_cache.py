@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from visloc.features import make_local_features
-from visloc.images import Photo
 from visloc.localization.query.feature_cache import FeatureCache, find_features
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import Photo
 
 
 def test_a_masked_photo_has_the_same_features_whichever_map_asked_before() -> None:

@@ -13,9 +13,9 @@ from visloc.errors import InvalidInput
 from visloc.evaluation import pose_error
 from visloc.features import make_local_features
 from visloc.geometry import Camera, Pose
-from visloc.images import read_photo
 from visloc.localization.localizer import Localizer
 from visloc.options import LocalizeOptions
+from visloc.photos.reading import read_photo
 from visloc.priors import PositionPrior, Priors
 from visloc.types import Answer, Localized, NotLocalized, Reason
 

@@ -9,9 +9,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from visloc.device import torch_device
 from visloc.features.backends.torch import computed_with, torch_convolution
 from visloc.features.networks.efficientnet.model import Block
+from visloc.runtime.device import torch_device
 
 
 class _BlockModule(nn.Module):

@@ -10,10 +10,10 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from visloc.device import torch_device
 from visloc.features.backends.torch import computed_with, torch_convolution
 from visloc.features.networks.r2d2.extractor import Seen
 from visloc.features.networks.r2d2.model import MEAN, STD, R2D2Network
+from visloc.runtime.device import torch_device
 
 _STRIP_ROWS = 32  # rows of x that the heads see at a time: bounds their memory
 

@@ -10,10 +10,10 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from visloc.device import torch_device
 from visloc.features.backends.torch import computed_with, torch_convolution
 from visloc.features.networks.xfeat.extractor import Seen
 from visloc.features.networks.xfeat.model import CELL_PX, LAYERS, XFeatNetwork
+from visloc.runtime.device import torch_device
 
 
 class XFeatModule(nn.Module):

@@ -5,8 +5,8 @@ import re
 import pytest
 from packaging.requirements import Requirement
 
-from supply_chain.dependencies import closure, of_extras, pinned
-from supply_chain.lock import LOCKS, NOT_LOCKED, locked
+from tools.supply_chain.dependencies import closure, of_extras, pinned
+from tools.supply_chain.lock import LOCKS, NOT_LOCKED, locked
 
 LINE = re.compile(r"([a-z0-9-]+)==(\S+) --hash=sha256:[0-9a-f]{64}")
 

@@ -8,7 +8,7 @@ import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
 import pycolmap
 import pytest
 
-from supply_chain.licences import (
+from tools.supply_chain.licences import (
     PAGE,
     Licensed,
     dependencies,

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageOps, TiffImagePlugin
 
 from tests.heic import heic, tiled_heic
-from visloc import photo_formats
 from visloc.errors import InvalidInput, NotFound, TooLarge
-from visloc.images import (
+from visloc.photos import formats as photo_formats
+from visloc.photos.reading import (
     ImageLimits,
     read_photo,
     read_photo_file,
@@ -415,7 +415,7 @@ def test_a_jpeg_of_very_many_scans_is_refused_before_it_is_decoded(
     before_each: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "visloc.photo_formats._decode_with_opencv", lambda *_: pytest.fail("it was decoded")
+        "visloc.photos.formats._decode_with_opencv", lambda *_: pytest.fail("it was decoded")
     )
 
     error = refusal(progressive(more=before_each, times=300))

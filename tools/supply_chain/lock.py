@@ -17,7 +17,7 @@ from typing import Any
 
 from packaging.requirements import Requirement
 
-from supply_chain.dependencies import (
+from tools.supply_chain.dependencies import (
     BUILD_TOOLS,
     IMAGES,
     ROOT,
@@ -30,7 +30,7 @@ from supply_chain.dependencies import (
 LOCKS = ROOT / "docker" / "locks"
 # torch, and what it needs only to build upon it.
 NOT_LOCKED = ("torch", "setuptools")
-_HEADER = "# Made by `python -m supply_chain.lock` from constraints.txt.\n"
+_HEADER = "# Made by `python -m tools.supply_chain.lock` from constraints.txt.\n"
 
 
 def locked() -> dict[str, dict[str, str]]:

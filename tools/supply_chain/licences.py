@@ -1,6 +1,6 @@
 """Lists the licences of all dependencies, and checks them against policy.toml.
 
-``python -m supply_chain.licences`` fails for a licence that the policy does not allow;
+``python -m tools.supply_chain.licences`` fails for a licence that the policy does not allow;
 ``--write`` also writes docs/licences.md.
 """
 
@@ -12,12 +12,12 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import distribution
-from pathlib import PurePath
+from pathlib import Path, PurePath
 from typing import Any
 
-from supply_chain.dependencies import IMAGES, ROOT, of_extras, pinned
+from tools.supply_chain.dependencies import IMAGES, ROOT, of_extras, pinned
 
-POLICY = ROOT / "supply_chain" / "policy.toml"
+POLICY = Path(__file__).with_name("policy.toml")
 PAGE = ROOT / "docs" / "licences.md"
 _EXTRAS = (
     *("mapping", "service", "gem", "s3", "cluster", "tracing", "clients", "compare", "ros"),

@@ -37,8 +37,8 @@ from PIL.TiffImagePlugin import (
 from PIL.WebPImagePlugin import WebPImageFile
 
 from visloc.errors import refuse
-from visloc.file_kinds import HEAD_BYTES, file_kind
-from visloc.heic import decode_heic, heic_outline
+from visloc.photos.file_kinds import HEAD_BYTES, file_kind
+from visloc.photos.heic import decode_heic, heic_outline
 
 FORMATS = "JPEG, HEIC, PNG, WebP, AVIF, TIFF or BMP"
 # How the names of photos end, in lower case.

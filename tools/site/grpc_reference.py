@@ -15,7 +15,7 @@ from google.protobuf.descriptor_pb2 import (
 )
 from grpc_tools import protoc
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 PROTO = "visloc_api/v1/localization.proto"
 # Field numbers of descriptor.proto, of which the paths of comments are made.
 _MESSAGES, _SERVICES, _MEMBERS = 4, 6, 2

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
 from visloc.errors import VislocError, refuse
-from visloc.photo_formats import (
+from visloc.photos.formats import (
     FORMATS,
     MALFORMED,
     MAX_PARTS,

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from packaging.requirements import Requirement
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 PROJECT = "visloc"
 # The extras that each image installs; `build` makes the wheel of the project.
 IMAGES: Mapping[str, Sequence[str]] = {

@@ -6,7 +6,7 @@ import struct
 import pytest
 from PIL import Image
 
-from visloc.file_kinds import file_kind
+from visloc.photos.file_kinds import file_kind
 
 
 def kind_of(head: bytes) -> str | None:

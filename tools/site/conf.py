@@ -8,8 +8,8 @@ from pydantic import BaseModel
 from sphinx.application import Sphinx
 
 import visloc
-from docs_site.grpc_reference import grpc_reference
-from docs_site.http_reference import http_reference
+from tools.site.grpc_reference import grpc_reference
+from tools.site.http_reference import http_reference
 
 project = "visloc"
 author = "the visloc authors"

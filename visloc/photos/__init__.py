@@ -1,0 +1,1 @@
+"""Photos as files: their formats, metadata and pixels."""
