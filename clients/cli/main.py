@@ -23,6 +23,7 @@ from clients.errors import not_understood
 from clients.evaluation.results import check_can_be_written, write_whole
 from clients.wire.requests import read_image
 from visloc.errors import VislocError
+from visloc.extensions import LOCALIZE_COMMANDS, extensions, load
 from visloc.geometry import Camera
 from visloc.types import MaskedImage
 
@@ -125,6 +126,8 @@ app.command()(bag)
 app.command()(evaluate)
 app.command()(submit)
 app.command()(retrieve)
+for _name, _entry in extensions(LOCALIZE_COMMANDS).items():
+    app.command(_name)(load(_entry))
 
 
 def _fail(code: str, message: str) -> NoReturn:

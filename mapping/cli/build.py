@@ -23,7 +23,7 @@ from mapping.cli.display import (
 from mapping.cli.progress import StageProgress
 from mapping.cluster.stage_timings import Costs
 from mapping.cluster.storage import is_map_folder, is_remote, open_store, scratch_folder
-from mapping.importers import IMPORTERS, MASKS, ImportSummary, import_dataset, imported
+from mapping.importers import MASKS, ImportSummary, import_dataset, imported, importer_names
 from mapping.importers.scans import refuse_scan
 from mapping.methods.rgbd import DepthSettings
 from mapping.methods.sfm_settings import SfmSettings
@@ -60,7 +60,7 @@ class ImportSettings:
     """The options of ``mapping import``."""
 
     format_name: Annotated[
-        str, typer.Argument(metavar="FORMAT", help=f"One of {', '.join(IMPORTERS)}.")
+        str, typer.Argument(metavar="FORMAT", help=f"One of {', '.join(importer_names())}.")
     ]
     path: Annotated[Path, typer.Argument(help="File or folder in this format.")]
     map_id: Annotated[

@@ -29,6 +29,7 @@ from mapping.cli.report import report
 from mapping.cli.sets import set_maps, split
 from mapping.cli.update import update
 from visloc.errors import VislocError
+from visloc.extensions import MAPPING_COMMANDS, extensions, load
 
 COMMANDS: Mapping[str, Callable[..., None]] = {
     "capture": capture,
@@ -65,6 +66,8 @@ app = typer.Typer(
 )
 for _name, _command in COMMANDS.items():
     app.command(_name)(from_settings(_command))
+for _name, _entry in extensions(MAPPING_COMMANDS).items():
+    app.command(_name)(from_settings(load(_entry)))
 
 
 def main() -> None:

@@ -18,8 +18,10 @@ from mapping.importers.model import ImportedImage, ImportedModel
 from mapping.progress import Progress, one_step
 from mapping.stages.outputs import refuse_existing
 from mapping.stages.work_folder import exclusive
+from visloc import extensions as extension_points
 from visloc.archive import MapStore
 from visloc.errors import refuse
+from visloc.extensions import extensions, load
 
 __all__ = [
     "IMPORTERS",
@@ -28,6 +30,7 @@ __all__ = [
     "ImportedImage",
     "ImportedModel",
     "import_dataset",
+    "importer_names",
     "imported",
     "read_model",
     "write_imported",
@@ -49,6 +52,11 @@ IMPORTERS: Mapping[str, tuple[str, str]] = {
     "rosbag": ("mapping.importers.rosbag", "read"),
     "strayscanner": ("mapping.importers.scans.apps", "read_stray_scanner"),
 }
+
+
+def importer_names() -> list[str]:
+    """Return the names of all formats, those of extensions included."""
+    return sorted({*IMPORTERS, *extensions(extension_points.IMPORTERS)})
 
 
 def _untold(_stage: str, _done: int, _total: int) -> None:
@@ -124,7 +132,7 @@ def read_model(
     """Read a foreign reconstruction.
 
     Args:
-        name: a key of ``IMPORTERS``.
+        name: one of ``importer_names``.
         path: the file or folder that the format consists of.
         photos: the folder that names of photos are relative to; None takes the usual place.
         progress: told the stage, how much of it is done, and how much there is.
@@ -134,13 +142,17 @@ def read_model(
         DatasetError: ``import.*`` or ``camera.*``, with the file, and the line or image, that is
             wrong.
     """
-    if name not in IMPORTERS:
-        raise refuse("import.unknown_format", field="FORMAT", expected=IMPORTERS, got=name)
+    if name not in importer_names():
+        raise refuse("import.unknown_format", field="FORMAT", expected=importer_names(), got=name)
     # That of a bag is written.
     if photos is not None and not photos.is_dir() and (name != "rosbag" or photos.exists()):
         raise refuse("import.photos", field="--photos", got=str(photos))
-    module, function = IMPORTERS[name]
-    read: Callable[..., ImportedModel] = getattr(import_module(module), function)
+    read: Callable[..., ImportedModel]
+    if name in IMPORTERS:
+        module, function = IMPORTERS[name]
+        read = getattr(import_module(module), function)
+    else:
+        read = load(extensions(extension_points.IMPORTERS)[name])
     if name == "images":  # the only one that decodes photos, which takes long
         return read(path, photos, partial(progress, "photos"))
     with one_step(progress, "reading"):
@@ -157,7 +169,7 @@ def import_dataset(
     """Read a foreign reconstruction and write it as a kapture 1.1 dataset.
 
     Args:
-        name: a key of ``IMPORTERS``.
+        name: one of ``importer_names``.
         path: the file or folder that the format consists of.
         output: the dataset to make; it must not exist, and does not if this fails.
         photos: the folder that names of photos are relative to; None takes the usual place.

@@ -22,6 +22,7 @@ from service.http.responses import problem_response
 from service.http.scenes import add_scene_routes
 from service.http.static_page import add_page_routes
 from visloc.errors import InvalidInput, NotFound, VislocError, refuse
+from visloc.extensions import HTTP_ROUTES, extensions, load
 from visloc_api.words.json_text import MAX_NAME
 from visloc_api.words.message import refusal_of
 
@@ -50,6 +51,8 @@ def create_app(backend: Backend) -> App:
     add_map_routes(app)
     add_scene_routes(app)
     add_geopose_routes(app)
+    for entry in extensions(HTTP_ROUTES).values():
+        load(entry)(app)
     if settings.page:
         add_page_routes(app)
     return app

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from benchmarks.reliability.heavy_requests import progressive_jpeg
+from conftest import Query
 from service.security.key_file import Scope, edited_keys, new_key
-from tests.conftest import Query
 from tests.heic import tiled_heic
 from tests.serving import serving
 

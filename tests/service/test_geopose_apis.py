@@ -23,7 +23,7 @@ from visloc.geopose import geopose_of
 from visloc_api.v1 import localization_pb2 as pb2
 
 if TYPE_CHECKING:
-    from tests.conftest import Query
+    from conftest import Query
     from tests.service.conftest import Doors
 
 LATITUDE, LONGITUDE, ALTITUDE = 45.2178, 5.8083, 310.0

@@ -24,8 +24,8 @@ from rich.console import Console
 from clients import AsyncClient, Axes, Client, Near, session_from_map
 from clients.cli.main import main
 from clients.cli.maps_display import print_map
+from conftest import Query
 from service.http.openapi import example
-from tests.conftest import Query
 from visloc.archive import MapStore
 from visloc.archive.checks import (
     content_hash,

@@ -20,8 +20,8 @@ from moto.server import ThreadedMotoServer
 from benchmarks.reliability.replicas import Balanced, balanced, wait_until
 from benchmarks.reliability.service_process import READY_WITHIN_S, ServiceProcess
 from clients import Client
+from conftest import Query
 from service.security.key_file import Scope, edited_keys, new_key
-from tests.conftest import Query
 from visloc.archive import MapStore
 from visloc.archive.checks import json_text, manifest_hash
 from visloc.archive.packed import pack_map

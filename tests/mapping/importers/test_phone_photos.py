@@ -13,8 +13,8 @@ import pytest
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
+from conftest import Query
 from mapping.importers import import_dataset
-from tests.conftest import Query
 from tests.heic import heic
 from tests.turning import turned_camera, turned_pixels, turned_pose
 from visloc.archive import MapStore

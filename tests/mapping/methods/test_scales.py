@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from conftest import Query
 from mapping.pipeline.build import build_map
 from mapping.pipeline.settings import BuildSettings
-from tests.conftest import Query
 from visloc.archive import Map
 from visloc.geometry import Pose
 from visloc.in_process import LocalMap, open_map

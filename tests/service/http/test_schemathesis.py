@@ -9,7 +9,7 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 
 import pytest
 
-from tests.conftest import Query
+from conftest import Query
 from tests.fuzz.api import check_api
 from tests.service.conftest import Doors
 

@@ -1,0 +1,37 @@
+"""What extensions add: entry points of installed packages, those of ``visloc_extensions`` among them.
+
+An extension registers each thing that it adds with a line in its package's metadata, for ours in
+``pyproject.toml``: the group says what it is, the name is the one that users give, and the value
+is the object. Features are such groups too (``visloc.features.plugins``).
+"""
+
+from __future__ import annotations
+
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+# A function with annotated options, as those of ``mapping.cli``.
+MAPPING_COMMANDS = "visloc.mapping_commands"
+# A function with annotated options, as those of ``clients.cli``.
+LOCALIZE_COMMANDS = "visloc.localize_commands"
+# (path, folder of photos or None) -> mapping.importers.ImportedModel
+IMPORTERS = "visloc.importers"
+# (workers, address) -> context manager of a mapping.cluster.executors.Executor
+EXECUTORS = "visloc.executors"
+# (app) -> None: adds routes to the ASGI app of the service.
+HTTP_ROUTES = "visloc.http_routes"
+
+
+def extensions(group: str) -> dict[str, EntryPoint]:
+    """Return what installed packages add to a group, by name and in the names' order."""
+    return {entry.name: entry for entry in sorted(entry_points(group=group), key=lambda e: e.name)}
+
+
+def load(entry: EntryPoint) -> Any:
+    """Load what an extension adds; what its code raises names the extension."""
+    try:
+        return entry.load()
+    except Exception as error:
+        package = entry.module if entry.dist is None else entry.dist.name
+        error.add_note(f"raised by the extension {entry.name!r} ({entry.value}) of {package}")
+        raise
