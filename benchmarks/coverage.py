@@ -28,10 +28,11 @@ from numpy.typing import NDArray
 from scipy.stats import spearmanr
 
 from mapping.cluster.workers import Workers
+from mapping.own_test.held_out import Within, tolerance_of
 from mapping.pipeline.build import build_map
 from mapping.pipeline.settings import BuildSettings
 from mapping.report.held_out import hold_out
-from mapping.report.model import CoverageModel, Within, learn, tolerance_of
+from mapping.report.model import CoverageModel, learn
 from mapping.stages.work_folder import WorkFolder
 from samples.render import render_depth, render_photo
 from samples.scene import ROOM_SIZE_M, Scene, make_room

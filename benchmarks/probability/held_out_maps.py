@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.report.held_out import vanishing
+from mapping.own_test.held_out import vanishing
 from visloc.archive import Map
 from visloc.retrieval.rows import GlobalRows
 

@@ -11,7 +11,7 @@ import numpy as np
 from mapping.capture.frames import FilmedVideo
 from mapping.capture.job import Captured
 from mapping.capture.trying import LOST_SIZE, Trials
-from mapping.report.cameras import disputed_focal_lengths
+from mapping.maps.cameras import disputed_focal_lengths
 from mapping.stages.photos import some
 from visloc.archive import Map
 

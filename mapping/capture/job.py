@@ -14,12 +14,13 @@ from pathlib import Path
 from mapping.capture.frames import FilmedVideo, photo_name
 from mapping.capture.markers import find_markers, grey_photos
 from mapping.capture.placing import Yardstick, place
-from mapping.capture.settings import CaptureSettings, KnownLength, photo_named
+from mapping.capture.settings import CaptureSettings
 from mapping.capture.sources import Sources, find_sources, read_capture, study_videos
 from mapping.capture.trying import doubts_of_capture, lost_size
 from mapping.cluster.stage_timings import Costs
 from mapping.cluster.storage import storage_failed
 from mapping.cluster.workers import Workers
+from mapping.frames.known_length import KnownLength, photo_named
 from mapping.importers import ImportedModel, write_imported
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.pairing import PairSettings

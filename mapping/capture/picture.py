@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.capture.trying import Trials
-from mapping.report.grid import Plan
+from mapping.frames.plan import Plan
 from visloc.archive import Map
 from visloc.localization.map_view.constraints import MapGeometry
 

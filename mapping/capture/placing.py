@@ -14,14 +14,13 @@ from numpy.typing import NDArray
 from pydantic import JsonValue
 
 from mapping.capture.markers import Sighting, marker_sides
+from mapping.frames.known_length import Scale, scale_of_length
+from mapping.frames.plan import up_of_cameras
 from mapping.methods.sfm import UNPLACED
-from mapping.report.grid import up_of_cameras
 from mapping.stages.landmarks import MadeLandmarks, View
 from mapping.stages.photos import MappingPhoto
 from visloc.geometry import Similarity
 
-# Centres nearer together than this, of the extent of all, tell no scale.
-_LEAST_SHARE = 1e-3
 _UP = np.array([0.0, 0.0, 1.0])
 _DISAGREES = 0.05
 
@@ -39,21 +38,6 @@ class Yardstick:
     length: tuple[str, str, float] | None = None
     sightings: Sequence[Sighting] = ()
     marker_m: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Scale:
-    """Metres in a unit of the map.
-
-    Attributes:
-        metres: per unit; None when it could not be told.
-        note: where it is from, or why there is none.
-        record: for the manifest.
-    """
-
-    metres: float | None
-    note: str
-    record: Mapping[str, JsonValue]
 
 
 def place(
@@ -109,20 +93,6 @@ def _scale(yardstick: Yardstick, views: Mapping[str, View]) -> Scale | None:
     if yardstick.marker_m is not None:
         return _scale_of_markers(yardstick.sightings, yardstick.marker_m, views)
     return None
-
-
-def scale_of_length(
-    first: str, second: str, metres: float, centers: Mapping[str, NDArray[np.float64]]
-) -> Scale:
-    """Return the scale that the distance between two photos tells, of their centres by name."""
-    absent = [name for name in (first, second) if name not in centers]
-    if absent:
-        return Scale(None, f"no scale: {absent[0]} of --scale found no place in the map", {})
-    units = float(np.linalg.norm(centers[first] - centers[second]))
-    if units <= _LEAST_SHARE * float(np.ptp(np.array([*centers.values()]), axis=0).max()):
-        return Scale(None, "no scale: the photos of --scale were taken at one place", {})
-    record: dict[str, JsonValue] = {"by": "length", "photos": [first, second], "metres": metres}
-    return Scale(metres / units, f"scale: {first} and {second} are {metres:g} m apart", record)
 
 
 def _scale_of_markers(

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from mapping.frames.known_length import KnownLength, known_length, metres_in
 from mapping.options import (
     AcceptOption,
     ForceOption,
@@ -20,58 +19,7 @@ from mapping.options import (
     WeightsDirOption,
     WorkersOption,
 )
-from visloc.errors import refuse
 from visloc.features import DEFAULT_GLOBAL_FEATURES, DEFAULT_LOCAL_FEATURES
-
-_LENGTH = re.compile(r"(\d+(?:\.\d+)?)\s*(mm|cm|m)?", re.IGNORECASE)
-_METRES = {"mm": 0.001, "cm": 0.01, "m": 1.0}
-_LONGEST_M = 100_000.0
-
-
-@dataclass(frozen=True, slots=True)
-class KnownLength:
-    """The distance between where two photos were taken.
-
-    Attributes:
-        photos: what names each: a photo's name or its end, or VIDEO@SECONDS.
-        metres: positive.
-    """
-
-    photos: tuple[str, str]
-    metres: float
-
-
-def metres_in(text: str, field: str) -> float:
-    """Read ``3.2m``, ``320 cm`` or ``3.2``, metres.
-
-    Raises:
-        InvalidInput: ``capture.length``.
-    """
-    found = _LENGTH.fullmatch(text.strip())
-    metres = float(found[1]) * _METRES[(found[2] or "m").lower()] if found else 0.0
-    if not 0 < metres <= _LONGEST_M:
-        raise refuse("capture.length", field=field, got=text)
-    return metres
-
-
-def known_length(given: tuple[str, str, str]) -> KnownLength:
-    """Read ``--scale``; raises ``capture.length``."""
-    first, second, length = given
-    return KnownLength((first, second), metres_in(length, "--scale"))
-
-
-def photo_named(text: str, names: Collection[str]) -> str:
-    """Return the photo of this name, or the only one whose name ends so.
-
-    Raises:
-        InvalidInput: ``capture.photo``.
-    """
-    if text in names:
-        return text
-    ends = [one for one in names if one.endswith(f"/{text}")]
-    if len(ends) != 1:
-        raise refuse("capture.photo", field="--scale", got=f"{text}: {len(ends)} photos")
-    return ends[0]
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,15 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.capture.frames import FilmedVideo
+from mapping.own_test.held_out import come_back, doubts_of_length, spread_photos
 from mapping.own_test.verdict import LINKING_LANDMARKS, MAX_NAMES, MOST_APART
 from mapping.progress import ItemProgress
-from mapping.report.held_out import left_out_sets, localize_held_out, spread_photos
-from mapping.report.model import tolerance_of
 from visloc.archive import Map, MapStore
 from visloc.archive.schema import Doubt
 from visloc.errors import MapCorrupt, NotFound
 from visloc.geometry import Pose
-from visloc.localization.map_view.constraints import MapGeometry
 from visloc.pose.colmap import project
 
 LOST_SIZE = "size"
@@ -47,22 +45,8 @@ class Trials:
 def try_photos(opened: Map, progress: ItemProgress) -> Trials:
     """Ask the map for some of its photos, as if they and those beside them had not been taken."""
     images = spread_photos(len(opened.images), _MOST_TRIED)
-    right = _come_back(opened, images, progress)
+    right = come_back(opened, images, progress)
     return Trials(np.array(images, np.int64), np.array(right, np.bool_))
-
-
-def _come_back(opened: Map, images: Sequence[int], progress: ItemProgress) -> list[bool]:
-    viewpoints = MapGeometry(opened).viewpoints
-    within = tolerance_of(opened, viewpoints)
-    right = []
-    for done, image in enumerate(images):
-        progress(done, len(images))
-        sets = left_out_sets(opened, viewpoints, image)[:2]
-        right.append(
-            bool(sets) and within.holds(localize_held_out(opened, viewpoints, image, sets[-1]))
-        )
-    progress(len(images), len(images))
-    return right
 
 
 def doubts_of_capture(
@@ -84,10 +68,7 @@ def doubts_of_capture(
             "frames lie away from the rest"
         )
         found.append(Doubt(kind="order", message=message, photos=tuple(astray[:MAX_NAMES])))
-    if lost := _lost(opened, measured, astray):
-        message = "the size rests on photos that do not come back where they were taken (--scale)"
-        found.append(Doubt(kind="scale", message=message, photos=tuple(lost)))
-    return tuple(found)
+    return (*found, *doubts_of_length(opened, measured, astray))
 
 
 def lost_size(opened: Map, store: MapStore) -> tuple[Doubt, ...]:
@@ -108,16 +89,6 @@ def lost_size(opened: Map, store: MapStore) -> tuple[Doubt, ...]:
         "--marker-size again"
     )
     return (Doubt(kind=LOST_SIZE, message=message),)
-
-
-def _lost(opened: Map, measured: Sequence[str], astray: Sequence[str]) -> list[str]:
-    rows = {image.name: row for row, image in enumerate(opened.images)}
-    # Those that are not in the map gave it no size.
-    named = [name for name in measured if name in rows]
-    if not named:
-        return []
-    back = _come_back(opened, [rows[name] for name in named], lambda *_: None)
-    return [name for name, right in zip(named, back, strict=True) if not right or name in astray]
 
 
 def out_of_order(opened: Map, films: Mapping[str, FilmedVideo]) -> list[str]:

@@ -17,7 +17,7 @@ from mapping.cluster.stage_timings import Spent, StageCost
 from mapping.frames.georeference import Georeference
 from mapping.frames.rig_calibration import OUTLIER_MULTIPLE, RigCalibration, Spread
 from mapping.importers import ImportSummary
-from mapping.report.cameras import camera_lines, cameras_of
+from mapping.maps.cameras import camera_lines, cameras_of
 from visloc.archive import Map, MapStore
 from visloc.archive.places import GeoCircle
 from visloc.archive.schema import photo_file

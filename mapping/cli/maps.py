@@ -13,7 +13,6 @@ from typing import Annotated
 
 import typer
 
-from mapping.capture.settings import known_length
 from mapping.cli.acceptance import require_acceptance
 from mapping.cli.display import ERR, print_georeference, print_map, say, say_notes, summary_of
 from mapping.cli.progress import StageProgress
@@ -28,6 +27,7 @@ from mapping.frames.georeference import (
     read_correspondences,
 )
 from mapping.frames.kept_fixes import contradiction_of_fixes
+from mapping.frames.known_length import known_length
 from mapping.maps.export import EXPORTERS, Queries, export_map
 from mapping.maps.packing import write_packed
 from mapping.maps.sizing import publish_sized

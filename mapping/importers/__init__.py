@@ -30,8 +30,8 @@ __all__ = [
     "ImportedImage",
     "ImportedModel",
     "import_dataset",
-    "importer_names",
     "imported",
+    "importer_names",
     "read_model",
     "write_imported",
 ]

@@ -11,9 +11,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from mapping.own_test.held_out import spread_photos
 from mapping.own_test.trials import left_out_with
 from mapping.own_test.verdict import MOST_WRONG
-from mapping.report.held_out import spread_photos
 from visloc.archive import CoarseIndex, Map
 from visloc.localization.map_view.constraints import MapGeometry
 from visloc.sets.choosing import TileScore, plan

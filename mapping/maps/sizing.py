@@ -8,12 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from mapping.capture.placing import scale_of_length
-from mapping.capture.settings import KnownLength, photo_named
-from mapping.capture.trying import doubts_of_capture
 from mapping.frames.anchor import MAX_SCALE_ERROR
+from mapping.frames.known_length import KnownLength, photo_named, scale_of_length
 from mapping.maps.editing import content_of, moved
 from mapping.methods.sfm import UNPLACED
+from mapping.own_test.held_out import doubts_of_length
 from mapping.own_test.publishing import publish_tested, write_content
 from mapping.own_test.verdict import has_estimated_poses
 from mapping.progress import Progress
@@ -76,7 +75,7 @@ def publish_sized(
     # A doubt about the length that told the size before is settled.
     doubts = [doubt for doubt in manifest.parts.doubts if doubt.kind != "scale"]
     if has_estimated_poses(opened):
-        doubts += doubts_of_capture(opened, {}, (first, second))
+        doubts += doubts_of_length(opened, (first, second))
     store = MapStore(maps_dir)
     with successor_of(opened, store), store.incoming() as incoming:
         link_photos(incoming, photo_files(opened))

@@ -18,8 +18,8 @@ from mapping.cluster.executors import Executor
 from mapping.cluster.workers import THIS_PROCESS
 from mapping.frames.stored_queries import solve_stored
 from mapping.own_test.error_model import fitted_factor, mahalanobis2
+from mapping.own_test.held_out import match_held_out, spread_photos, taken_with
 from mapping.progress import ItemProgress, not_told
-from mapping.report.held_out import match_held_out, spread_photos, taken_with
 from visloc.archive import Map, open_map
 from visloc.archive.schema import MAX_FACTOR, MAX_WRONG_SCORES, OwnTest, Score
 from visloc.geometry import Pose, center_covariance

@@ -11,11 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mapping.cluster.workers import Workers
-from mapping.report.cameras import camera_lines
-from mapping.report.grid import Grid, Plan, forecast_grid, make_grid
-from mapping.report.held_out import HeldOut, hold_out
+from mapping.frames.plan import Plan
+from mapping.maps.cameras import camera_lines
+from mapping.own_test.held_out import HeldOut, Within, tolerance_of
+from mapping.report.grid import Grid, forecast_grid, make_grid
+from mapping.report.held_out import hold_out
 from mapping.report.look_alikes import LookAlike, find_look_alikes
-from mapping.report.model import Forecast, Learned, Within, learn, tolerance_of
+from mapping.report.model import Forecast, Learned, learn
 from mapping.report.statistics import statistics_of
 from mapping.report.weak_spots import WeakSpot, find_weak_spots
 from mapping.stages.work_folder import WorkFolder

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from mapping.cluster.workers import Workers
 from mapping.frames.stored_queries import solve_stored
-from mapping.report.held_out import HeldOut, ask_photos, match_held_out, opened_once
+from mapping.own_test.held_out import HeldOut, match_held_out
+from mapping.report.held_out import ask_photos, opened_once
 from mapping.stages.work_folder import Item, WorkFolder, key_of
 from visloc import __version__
 from visloc.archive import Map

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mapping.own_test.held_out import HeldOut, Within, too_seldom_seen
 from mapping.report.chance import (
     Chance,
     Outlook,
@@ -16,7 +17,6 @@ from mapping.report.chance import (
     fit_precision,
     outlook_of,
 )
-from mapping.report.held_out import HeldOut, too_seldom_seen
 from mapping.report.places import Places, sample_places
 from mapping.report.rematch import Counted, Rematch, count, fit_rematch
 from mapping.report.sight import Absent, Sight, look_around
@@ -24,34 +24,9 @@ from visloc.archive import Map
 from visloc.geometry import Camera, Pose
 from visloc.localization.map_view.viewpoints import Viewpoints
 
-# What counts as localized. In metric maps the high precision of Sattler et al. 2018, within shares
-# of the distance from which photos see: it would mean nothing around a coin, and too much above a
-# town. In others as much of that distance as the angle is of a turn.
-_POSITION_M, _ORIENTATION_DEG = 0.25, 2.0
-_LEAST_OF_REACH, _POSITION_OF_REACH, _MOST_OF_REACH = 0.01, 0.05, 0.2
 _NUM_FOLDS = 5
 _NOISE_PX = 1.0  # of a map without runs
 _MEDIAN_OF_RAYLEIGH = 1.1774  # by the standard deviation along each axis
-
-
-@dataclass(frozen=True, slots=True)
-class Within:
-    """The distance within which a photo counts as localized.
-
-    Attributes:
-        position: units of the world.
-        orientation_deg: degrees.
-    """
-
-    position: float
-    orientation_deg: float
-
-    def holds(self, run: HeldOut) -> bool:
-        """Whether a run was localized that well."""
-        return (
-            run.position_error <= self.position
-            and run.orientation_error_deg <= self.orientation_deg
-        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,15 +94,6 @@ class _Seen:
     camera: Camera
     sight: Sight
     counted: Counted
-
-
-def tolerance_of(opened: Map, viewpoints: Viewpoints) -> Within:
-    """Return the distances within which photos of a map count as localized."""
-    reach = viewpoints.reach
-    position = _POSITION_OF_REACH * reach
-    if opened.manifest.world.metric:
-        position = min(max(_POSITION_M, _LEAST_OF_REACH * reach), _MOST_OF_REACH * reach)
-    return Within(position, _ORIENTATION_DEG)
 
 
 def learn(

@@ -7,8 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mapping.report.grid import Grid, Plan, probabilities_of
-from mapping.report.model import CoverageModel, Forecast, Within
+from mapping.frames.plan import Plan
+from mapping.own_test.held_out import Within
+from mapping.report.grid import Grid, probabilities_of
+from mapping.report.model import CoverageModel, Forecast
 
 _MOST = 8
 _WEAK = 0.5

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from benchmarks.coverage import Outcome, print_table
-from mapping.report.model import Within
+from mapping.own_test.held_out import Within
 
 
 def test_predictors_are_ranked_by_what_came(capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
+from mapping.maps.cameras import origins_record
 from mapping.maps.editing import content_of, joined, moved, refuse_other_features, same_model
 from mapping.maps.merging.registration import Registration, register, updates_of
 from mapping.maps.sets import publish_set
 from mapping.own_test.publishing import publish_edited, refuse_not_accepted
 from mapping.pipeline.pieces import without_pieces
-from mapping.report.cameras import origins_record
 from mapping.stages.publishing import photo_files, sole_publisher
 from visloc.archive import GlobalFeatures, Map, MapContent, MapStore
 from visloc.archive.schema import ID_PATTERN

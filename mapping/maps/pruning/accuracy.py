@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mapping.frames.stored_queries import match_stored, solve_stored
 from mapping.maps.pruning.choosing import Kept
-from mapping.report.held_out import left_out_sets, vanishing
+from mapping.own_test.held_out import left_out_sets, vanishing
 from mapping.stages.photos import read_in_frame
 from visloc.archive import Map
 from visloc.errors import refuse

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from mapping.maps.cameras import cameras_of
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.pairing import PAIRINGS, PairSettings
 from mapping.pipeline.build import build_map
 from mapping.pipeline.settings import BuildSettings
-from mapping.report.cameras import cameras_of
 from mapping.sample import ANCHOR_ALTITUDE_M, ANCHOR_LATITUDE_DEG, ANCHOR_LONGITUDE_DEG
 from visloc.archive import Map, MapStore
 from visloc.errors import DatasetError, InvalidInput, NotFound, VislocError

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from mapping.cluster.workers import Workers
+from mapping.own_test.held_out import HeldOut, Within, tolerance_of
 from mapping.report.chance import Outlook, fit_chance, fit_precision, outlook_of
-from mapping.report.held_out import HeldOut, hold_out
-from mapping.report.model import Within, learn, tolerance_of
+from mapping.report.held_out import hold_out
+from mapping.report.model import learn
 from mapping.report.rematch import Rematch, count, fit_rematch
 from mapping.report.sight import Sight
 from mapping.stages.work_folder import WorkFolder

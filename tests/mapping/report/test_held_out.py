@@ -6,14 +6,9 @@ import numpy as np
 import pytest
 
 from mapping.cluster.workers import Workers
+from mapping.own_test.held_out import left_out_sets, localize_held_out, vanishing
 from mapping.report import held_out
-from mapping.report.held_out import (
-    chosen_photos,
-    hold_out,
-    left_out_sets,
-    localize_held_out,
-    vanishing,
-)
+from mapping.report.held_out import chosen_photos, hold_out
 from mapping.stages.work_folder import WorkFolder
 from visloc.localization.map_view.constraints import MapGeometry
 from visloc.options import LocalizeOptions

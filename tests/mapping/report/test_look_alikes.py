@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from mapping.cluster.workers import Workers
+from mapping.own_test.held_out import HeldOut
 from mapping.report import look_alikes
-from mapping.report.held_out import HeldOut, hold_out
+from mapping.report.held_out import hold_out
 from mapping.report.look_alikes import Search, find_look_alikes, shares_place
 from mapping.stages.work_folder import WorkFolder
 from visloc.archive import Map

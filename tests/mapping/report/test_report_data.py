@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from mapping.cluster.workers import Workers
+from mapping.frames.plan import Plan
+from mapping.own_test.held_out import HeldOut, Within
 from mapping.report import make_report_data
 from mapping.report.data import calibration_of, decimals_of, rank_correlation_of
-from mapping.report.grid import Plan, make_grid
-from mapping.report.held_out import HeldOut
-from mapping.report.model import Within
+from mapping.report.grid import make_grid
 from mapping.report.statistics import statistics_of
 from mapping.stages.work_folder import WorkFolder
 from visloc.archive import MapStore

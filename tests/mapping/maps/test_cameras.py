@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from mapping.report.cameras import camera_lines, cameras_of, origins_record
+from mapping.maps.cameras import camera_lines, cameras_of, origins_record
 from visloc.archive import ImageRecord, Map, MapStore
 from visloc.geometry import Camera
 
