@@ -31,8 +31,6 @@ from mapping.cluster.workers import Workers
 from mapping.own_test.held_out import Within, tolerance_of
 from mapping.pipeline.build import build_map
 from mapping.pipeline.settings import BuildSettings
-from mapping.report.held_out import hold_out
-from mapping.report.model import CoverageModel, learn
 from mapping.stages.work_folder import WorkFolder
 from samples.render import render_depth, render_photo
 from samples.scene import ROOM_SIZE_M, Scene, make_room
@@ -46,6 +44,8 @@ from visloc.localization.map_view.constraints import MapGeometry
 from visloc.options import LocalizeOptions
 from visloc.photos.reading import read_photo_file
 from visloc.types import Localized
+from visloc_extensions.report.held_out import hold_out
+from visloc_extensions.report.model import CoverageModel, learn
 
 _SYNTHETIC_FEATURES = "sift"
 _NUM_MAPPING, _NUM_QUERIES = 40, 120

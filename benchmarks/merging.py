@@ -23,15 +23,15 @@ from rich.console import Console
 from scipy.spatial.transform import Rotation
 
 from mapping.cli.progress import StageProgress
-from mapping.cli.prune import accuracy_rows
-from mapping.maps.merging import merge_maps
-from mapping.maps.pruning.accuracy import of_queries
 from mapping.pipeline.build import build_map
 from mapping.pipeline.settings import BuildSettings
 from visloc.archive import Map, MapStore
 from visloc.features import make_global_descriptor, make_local_features
 from visloc.geometry import Similarity, rotation_angle
 from visloc.kapture import read_dataset, write_dataset
+from visloc_extensions.living_maps.merging import merge_maps
+from visloc_extensions.living_maps.prune_command import accuracy_rows
+from visloc_extensions.living_maps.pruning.accuracy import of_queries
 
 ELSEWHERE = Similarity(
     1.0,

@@ -15,13 +15,13 @@ from typing import Annotated
 
 import typer
 
-from mapping.cli.prune import accuracy_rows, parse_size
 from mapping.maps.editing import content_of, selected
-from mapping.maps.pruning.accuracy import of_queries
-from mapping.maps.pruning.job import keep_within
 from mapping.own_test.publishing import publish_edited
 from visloc.archive import Map, MapStore, open_map
 from visloc.features import make_global_descriptor, make_local_features
+from visloc_extensions.living_maps.prune_command import accuracy_rows, parse_size
+from visloc_extensions.living_maps.pruning.accuracy import of_queries
+from visloc_extensions.living_maps.pruning.job import keep_within
 
 
 def pruned(opened: Map, size: str, root: Path) -> Map:

@@ -25,7 +25,6 @@ import numpy as np
 import typer
 
 from benchmarks.map_methods import BINS, Stopwatch, measure
-from mapping.maps.updating import UpdateSettings, update_map
 from mapping.pipeline.build import build_map
 from mapping.pipeline.settings import BuildSettings
 from visloc.archive import Map, open_map
@@ -34,6 +33,7 @@ from visloc.evaluation import pose_error
 from visloc.features import DEFAULT_LOCAL_FEATURES
 from visloc.geometry import Pose, Similarity
 from visloc.kapture import Dataset, read_dataset, write_dataset
+from visloc_extensions.living_maps.updating import UpdateSettings, update_map
 
 SEED = 0
 FEATURES = "local features"

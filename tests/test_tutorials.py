@@ -19,7 +19,7 @@ from tests import docs_check
 from tests.rosbags_made import write_bag
 from visloc.kapture import read_dataset
 
-# How many commands run; your-room takes minutes more, in tests/mapping/capture/test_tutorial.py.
+# How many commands run; your-room takes minutes more, and has its own test.
 TUTORIALS = {
     "beach": 5,
     "building": 8,

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from benchmarks.probability.disguises import DISGUISES, Image, printed, resembling
 from benchmarks.probability.held_out_maps import without
-from mapping.report.look_alikes import shares_place
 from samples.render import render_photo
 from samples.scene import NUM_SURFACES, make_room
 from samples.trajectories import query_trajectory, stereo_rig
@@ -32,6 +31,7 @@ from visloc.options import LocalizeOptions
 from visloc.photos.reading import Photo, read_photo_file
 from visloc.pose.views import MatchedView
 from visloc.priors import NO_PRIORS
+from visloc_extensions.report.look_alikes import shares_place
 
 # A pose is right this near to the truth, as a part of the distance from which photos see, and
 # wrong beyond twice as much. What lies between teaches nothing.

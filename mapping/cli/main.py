@@ -11,7 +11,6 @@ import typer
 
 from mapping.cli.acceptance import use
 from mapping.cli.build import build, import_
-from mapping.cli.capture import capture
 from mapping.cli.datasets import (
     calibrate_rig_command,
     dataset,
@@ -23,16 +22,11 @@ from mapping.cli.datasets import (
 from mapping.cli.display import ERR
 from mapping.cli.from_settings import from_settings
 from mapping.cli.maps import anchor, edit, export, inspect, pack, upgrade, verify
-from mapping.cli.merge import merge
-from mapping.cli.prune import prune
-from mapping.cli.report import report
 from mapping.cli.sets import set_maps, split
-from mapping.cli.update import update
 from visloc.errors import VislocError
 from visloc.extensions import MAPPING_COMMANDS, extensions, load
 
 COMMANDS: Mapping[str, Callable[..., None]] = {
-    "capture": capture,
     "build": build,
     "pairs": pairs,
     "calibrate-rig": calibrate_rig_command,
@@ -45,12 +39,8 @@ COMMANDS: Mapping[str, Callable[..., None]] = {
     "inspect": inspect,
     "verify": verify,
     "use": use,
-    "report": report,
-    "prune": prune,
-    "merge": merge,
     "set": set_maps,
     "split": split,
-    "update": update,
     "export-features": export_features_command,
     "dataset": dataset,
     "import-features": import_features_command,

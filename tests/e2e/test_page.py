@@ -19,7 +19,6 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
-from mapping.cli.report import write_report
 from mapping.frames.georeference import given_place, publish_anchored
 from mapping.maps.editing import content_of
 from mapping.own_test.publishing import publish_edited
@@ -29,6 +28,7 @@ from visloc.archive.schema import PIECES, Doubt
 from visloc.evaluation import pose_error
 from visloc.geometry import Camera, Pose
 from visloc.options import Solver
+from visloc_extensions.report.command import write_report
 
 ROOT = Path(__file__).resolve().parents[2]
 BUILT = ROOT / "service" / "page" / "built"

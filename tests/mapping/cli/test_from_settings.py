@@ -14,7 +14,6 @@ from mapping.cli.build import ImportSettings
 from mapping.cli.from_settings import from_settings
 from mapping.cli.maps import AnchorSettings
 from mapping.cluster.workers import DEFAULT_WORKERS
-from mapping.maps.updating import UpdateSettings
 from mapping.methods.rgbd import DepthSettings
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.options import Names, OnCommandLine
@@ -23,6 +22,7 @@ from mapping.pipeline.pairs import PairsJob
 from mapping.pipeline.settings import BuildSettings
 from visloc.geometry import PixelOrigin
 from visloc.options import Fusion, Inference
+from visloc_extensions.living_maps.updating import UpdateSettings
 
 
 def read_by(command: Any, *arguments: str) -> Any:

@@ -15,17 +15,17 @@ import pytest
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
-from mapping.capture.sources import find_sources, read_capture
 from mapping.cli.main import app as mapping_app
 from mapping.importers import import_dataset, read_model, write_imported
 from mapping.importers.scans import app_of
 from mapping.stages.depth import read_depth
 from samples.film import encode_video
-from tests.mapping.capture.test_video import turned
 from visloc.errors import DatasetError, InvalidInput, VislocError
 from visloc.geometry import Camera, Pose
 from visloc.kapture import Dataset, FileRecord, read_dataset
 from visloc.photos.reading import read_photo_file
+from visloc_extensions.capture.sources import find_sources, read_capture
+from visloc_extensions.capture.tests.test_video import turned
 
 _UPRIGHT = (0, 1, -1, 0)  # the display matrix of a phone held upright
 ARKIT = np.diag([1.0, -1.0, -1.0, 1.0])

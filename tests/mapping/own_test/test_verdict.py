@@ -13,7 +13,6 @@ import pytest
 
 from mapping.cli.acceptance import require_acceptance, use
 from mapping.maps.editing import content_of
-from mapping.maps.merging import merge_maps
 from mapping.maps.splitting import split_map
 from mapping.own_test.publishing import publish_edited
 from mapping.own_test.trials import OwnTestRun, run_own_test
@@ -25,6 +24,7 @@ from visloc.archive.schema import Doubt
 from visloc.errors import Conflict, InvalidInput, NotFound
 from visloc.geometry import Pose
 from visloc.kapture import read_dataset, write_dataset
+from visloc_extensions.living_maps.merging import merge_maps
 
 
 def ran(tested: int, refused: int, wrong: int) -> OwnTestRun:

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapping.maps.updating import UpdateSettings, update_map
 from mapping.methods.sfm_settings import SfmSettings
 from visloc.archive import Map, MapStore, verify_map
 from visloc.errors import DatasetError, InvalidInput, VislocError
@@ -27,6 +26,7 @@ from visloc.localization.localizer import Localizer
 from visloc.options import LocalizeOptions
 from visloc.photos.reading import read_photo_file
 from visloc.types import LocalFeatures, Localized, QueryFeatures
+from visloc_extensions.living_maps.updating import UpdateSettings, update_map
 
 Build = Callable[..., Map]
 Rewrite = Callable[..., None]

@@ -13,13 +13,9 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from mapping.cli.main import app
-from mapping.cli.report import write_report
 from mapping.maps.export import EXPORTERS, export_map
-from mapping.maps.merging import merge_maps
-from mapping.maps.pruning import prune_map
 from mapping.maps.sets import publish_set
 from mapping.maps.splitting import split_map
-from mapping.maps.updating import UpdateSettings, update_map
 from mapping.pipeline.build import build_map
 from mapping.pipeline.settings import BuildSettings
 from visloc.archive import Map, MapStore, open_map, open_set, verify_map
@@ -34,6 +30,10 @@ from visloc.localization.map_view.constraints import MapGeometry
 from visloc.options import LocalizeOptions
 from visloc.photos.reading import Photo, read_photo_file
 from visloc.types import Localized, Uncertainty
+from visloc_extensions.living_maps.merging import merge_maps
+from visloc_extensions.living_maps.pruning import prune_map
+from visloc_extensions.living_maps.updating import UpdateSettings, update_map
+from visloc_extensions.report.command import write_report
 
 
 def quiet(*_: object) -> None:

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mapping.maps.export_features import export_features
-from mapping.maps.updating import UpdateSettings, update_map
 from mapping.pipeline.build import build_map
 from mapping.pipeline.settings import BuildSettings
 from mapping.stages.photos import read_in_frame
@@ -37,6 +36,7 @@ from visloc.localization.localizer import Localizer
 from visloc.options import Inference, LocalizeOptions, ReadAs
 from visloc.photos.reading import read_photo, read_photo_file, turn_of
 from visloc.types import Localized
+from visloc_extensions.living_maps.updating import UpdateSettings, update_map
 
 SIZE = (256, 192)
 

@@ -1,6 +1,0 @@
-"""``mapping prune``: a smaller version of a map, of what localization needs most."""
-
-from mapping.maps.pruning.choosing import Kept, choose, size_with
-from mapping.maps.pruning.job import Pruned, prune_map
-
-__all__ = ["Kept", "Pruned", "choose", "prune_map", "size_with"]

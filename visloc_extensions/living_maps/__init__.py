@@ -1,0 +1,1 @@
+"""Maps that change: ``mapping update``, ``merge`` and ``prune``."""
