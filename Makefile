@@ -10,7 +10,7 @@ PAGE_SOURCES := $(shell find web/src web/client/src web/*.html web/*.json web/cl
 .DEFAULT_GOAL := help
 # Vite needs this much; without it the service has no page, and says so.
 NODE_IS_THERE = command -v npm >/dev/null && node -e 'const [a, b] = process.versions.node.split(".").map(Number); process.exit(a > 22 || (a === 22 && b >= 12) || (a === 20 && b >= 19) ? 0 : 1)'
-.PHONY: help install licences-check page check-page browser balancer promtool demo test test-all docs-check docs-errors docs-options licences lock sbom audit fuzz fuzz-api train-smoke bench bench-gpu bench-scale bench-change results trust fmt lint types contracts proto proto-check site docs-links check serve clean
+.PHONY: help install apart size licences-check page check-page browser balancer promtool demo test test-all docs-check docs-errors docs-options licences lock sbom audit fuzz fuzz-api train-smoke bench bench-gpu bench-scale bench-change results trust fmt lint types contracts proto proto-check site docs-links check serve clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "%-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -78,6 +78,12 @@ test: install browser balancer promtool ## the tests, in about twelve minutes on
 
 test-all: install browser balancer promtool ## the slow tests too
 	$(BIN)/pytest
+
+apart: install ## the core's checks and tests without each extension in turn: NAMES
+	$(BIN)/python -m tools.apart $(NAMES) $(ARGS)
+
+size: install ## lines by room of the core and by extension, against pyproject.toml
+	$(BIN)/python -m tools.size
 
 docs-check: install ## run the commands that the docs print, or parse those that take hours: PAGES
 	$(BIN)/python -m tests.docs_check $(PAGES)
@@ -174,10 +180,10 @@ check-page: page ## types, format and unit tests of web/
 licences-check: install ## dependencies have licences that the policy allows
 	$(BIN)/python -m tools.supply_chain.licences
 
-check: lint types contracts licences-check proto-check check-page site ## what must be green before review
+check: lint types contracts size licences-check proto-check check-page site ## what must be green before review
 
 serve: install ## serve the maps in maps/ on 127.0.0.1:8000 (HTTP) and :50051 (gRPC)
 	$(BIN)/python -m service --maps-dir maps
 
 clean: ## remove what make made
-	rm -rf $(VENV) .site .site-links .sbom .demo .bench .change .results .trust web/node_modules web/client/dist service/page/built
+	rm -rf $(VENV) .apart .site .site-links .sbom .demo .bench .change .results .trust web/node_modules web/client/dist service/page/built
