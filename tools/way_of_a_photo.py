@@ -24,7 +24,7 @@ from clients import Client
 ROOT = Path(__file__).resolve().parents[1]
 # Python imports it first in every process. The file is written when its process is told to end,
 # and every second, as workers may be killed.
-_HOOK = '''
+_HOOK = """
 import atexit, json, os, sys, threading, time
 root, folder = os.environ["WAY_ROOT"] + "/", os.environ["WAY_FOLDER"]
 began = {}
@@ -47,7 +47,7 @@ def follow():
     threading.Thread(target=loop, daemon=True).start()
 follow()
 os.register_at_fork(after_in_child=follow)
-'''
+"""
 
 
 def main(maps_dir: Path, map_ref: str, photo: Path) -> None:

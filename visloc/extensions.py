@@ -18,6 +18,8 @@ LOCALIZE_COMMANDS = "visloc.localize_commands"
 IMPORTERS = "visloc.importers"
 # (workers, address) -> context manager of a mapping.cluster.executors.Executor
 EXECUTORS = "visloc.executors"
+# (URL, folder of copies, bytes of copies) -> visloc.archive.MapStore; the name is "url".
+MAP_STORES = "visloc.map_stores"
 # (app) -> None: adds routes to the ASGI app of the service.
 HTTP_ROUTES = "visloc.http_routes"
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
 from typing import Any, cast
 
-from visloc.archive import MapStore, sha256_of
+from visloc.archive import MapStore, open_remote_store, sha256_of
 from visloc.errors import VislocError, refuse
 from visloc.kapture import Dataset, read_dataset
 
@@ -94,9 +94,7 @@ def open_store(maps_dir: Path, cache_dir: Path) -> MapStore:
     """Return the store of a folder, or of a URL with local copies in ``cache_dir``."""
     if not is_remote(maps_dir):
         return MapStore(maps_dir)
-    from visloc.archive.remote_store import RemoteMapStore  # its libraries are optional
-
-    return RemoteMapStore(str(maps_dir), cache_dir, sys.maxsize)
+    return open_remote_store(str(maps_dir), cache_dir, sys.maxsize)
 
 
 def is_map_folder(ref: str) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from visloc.archive import MapStore
+from visloc.archive import MapStore, open_remote_store
 
 
 def open_store(maps_dir: str, cache_dir: Path, max_cache_bytes: int) -> MapStore:
@@ -14,10 +14,8 @@ def open_store(maps_dir: str, cache_dir: Path, max_cache_bytes: int) -> MapStore
         ValueError: the URL cannot be used, or the path is not a folder.
     """
     if "://" in maps_dir:
-        from visloc.archive.remote_store import RemoteMapStore  # its libraries take long to load
-
         try:
-            return RemoteMapStore(maps_dir, cache_dir, max_cache_bytes)
+            return open_remote_store(maps_dir, cache_dir, max_cache_bytes)
         except (ImportError, ValueError) as error:  # a protocol that is not known or not installed
             raise ValueError(f"the URL cannot be used: {error}") from None
     folder = Path(maps_dir)

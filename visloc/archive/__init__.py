@@ -30,7 +30,7 @@ from visloc.archive.sets import (
     verify_set,
     write_set,
 )
-from visloc.archive.store import MapStore
+from visloc.archive.store import MapStore, open_remote_store
 from visloc.archive.writer import write_map
 
 __all__ = [
@@ -60,6 +60,7 @@ __all__ = [
     "circle_of",
     "down_of",
     "open_map",
+    "open_remote_store",
     "open_set",
     "pose_row",
     "read_any_outline",

@@ -31,9 +31,29 @@ from visloc.archive.version_rules import (
     version_in_use,
 )
 from visloc.errors import MapCorrupt, NotFound, VislocError, refuse
+from visloc.extensions import MAP_STORES, extensions, load
 
 # Every map has it, and no set.
 _IMAGE_POSES = "image_poses.npy"
+
+
+def open_remote_store(url: str, cache_dir: Path, max_cache_bytes: int) -> MapStore:
+    """Return the store at a URL, which an extension opens.
+
+    Args:
+        url: as fsspec has it.
+        cache_dir: folder of the copies; several URLs may share it.
+        max_cache_bytes: room for copies; the least recently used are deleted first.
+
+    Raises:
+        ImportError: when no extension opens URLs, or what this one needs is not installed.
+        ValueError: for a URL that cannot be used.
+    """
+    entry = extensions(MAP_STORES).get("url")
+    if entry is None:
+        raise ImportError("maps at URLs need the extension object_storage")
+    store: MapStore = load(entry)(url, cache_dir, max_cache_bytes)
+    return store
 
 
 class MapStore:

@@ -21,9 +21,7 @@ from moto.server import ThreadedMotoServer
 
 from service.engine.stores import open_store
 from visloc.archive import MapStore, open_map, verify_map
-from visloc.archive.backends import published_index, storage
 from visloc.archive.checks import json_text, manifest_hash
-from visloc.archive.remote_store import RemoteMapStore
 from visloc.errors import (
     Conflict,
     InvalidInput,
@@ -32,6 +30,8 @@ from visloc.errors import (
     StorageFull,
     Unavailable,
 )
+from visloc_extensions.object_storage import published_index, storage
+from visloc_extensions.object_storage.remote_store import RemoteMapStore
 
 LARGE = 2**30
 SECRET = "wJalrXUtnFEMI"  # of no account

@@ -38,11 +38,11 @@ from tests.service.map_sets import (
     quiet,
 )
 from visloc.archive import MapOutline, MapStore, SetOutline
-from visloc.archive.remote_store import RemoteMapStore
 from visloc.errors import Conflict, NotFound, Unavailable, VislocError
 from visloc.geometry import Pose
 from visloc.kapture import read_dataset
 from visloc.priors import PositionPrior, Priors
+from visloc_extensions.object_storage.remote_store import RemoteMapStore
 
 Serve = Callable[..., AbstractContextManager[Any]]
 

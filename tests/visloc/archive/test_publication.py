@@ -16,11 +16,11 @@ import pytest
 from moto.server import ThreadedMotoServer
 
 from visloc.archive import MapStore, verify_map
-from visloc.archive.backends import publication
-from visloc.archive.backends.objects import ObjectBackend
 from visloc.archive.checks import content_hash, json_text, manifest_hash, sha256_of
-from visloc.archive.remote_store import RemoteMapStore
 from visloc.errors import Conflict
+from visloc_extensions.object_storage import publication
+from visloc_extensions.object_storage.objects import ObjectBackend
+from visloc_extensions.object_storage.remote_store import RemoteMapStore
 
 LARGE = 2**30
 NewStore = Callable[[str], RemoteMapStore]

@@ -24,10 +24,10 @@ from visloc.archive import (
 )
 from visloc.archive.checks import content_hash, json_text, manifest_hash, sha256_of
 from visloc.archive.packed import pack_map, unpack_map
-from visloc.archive.remote_store import RemoteMapStore
 from visloc.errors import Conflict, InvalidInput, MapCorrupt, NotFound
 from visloc.geometry import Similarity
 from visloc.sets.coarse import TILE_LISTS
+from visloc_extensions.object_storage.remote_store import RemoteMapStore
 
 LARGE = 2**30
 SECOND = Similarity(1.0, np.eye(3), np.array([100.0, 0.0, 3.0]))

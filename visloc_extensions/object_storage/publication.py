@@ -25,10 +25,10 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from visloc.archive.backends.base import CURRENT, MANIFEST, text_of_current
-from visloc.archive.backends.storage import Storage
 from visloc.archive.checks import sha256_of
 from visloc.archive.version_rules import outdated, version_exists
 from visloc.errors import VislocError, refuse
+from visloc_extensions.object_storage.storage import Storage
 
 logger = logging.getLogger(__name__)
 

@@ -18,8 +18,8 @@ from time import monotonic
 from pydantic import RootModel, ValidationError
 
 from visloc.archive.backends.base import CURRENT, MANIFEST, text_of_current
-from visloc.archive.backends.storage import NEVER, Storage
 from visloc.errors import Unavailable
+from visloc_extensions.object_storage.storage import NEVER, Storage
 
 logger = logging.getLogger(__name__)
 

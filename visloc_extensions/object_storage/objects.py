@@ -16,10 +16,6 @@ from pathlib import Path
 from time import monotonic
 
 from visloc.archive.backends.base import CURRENT, MANIFEST
-from visloc.archive.backends.copies import Copies, size_of
-from visloc.archive.backends.publication import Publisher
-from visloc.archive.backends.published_index import PublishedIndex
-from visloc.archive.backends.storage import Storage
 from visloc.archive.checks import (
     MAX_MANIFEST_BYTES,
     check_files,
@@ -33,6 +29,10 @@ from visloc.archive.set_schema import SetManifest
 from visloc.archive.sets import SetOutline, read_any_outline, verify_any
 from visloc.archive.version_rules import refuse_renamed
 from visloc.errors import Conflict, MapCorrupt, Unavailable, VislocError, refuse
+from visloc_extensions.object_storage.copies import Copies, size_of
+from visloc_extensions.object_storage.publication import Publisher
+from visloc_extensions.object_storage.published_index import PublishedIndex
+from visloc_extensions.object_storage.storage import Storage
 
 logger = logging.getLogger(__name__)
 

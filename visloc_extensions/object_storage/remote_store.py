@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from visloc.archive.backends.objects import ObjectBackend
 from visloc.archive.store import MapStore
+from visloc_extensions.object_storage.objects import ObjectBackend
 
 
 class RemoteMapStore(MapStore):
