@@ -1,1 +1,1 @@
-"""Maps at a URL that fsspec knows, such as ``s3://``, with copies on the machine that reads them."""
+"""Maps at URLs that fsspec knows, such as ``s3://``, with copies on the reading machine."""
