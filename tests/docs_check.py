@@ -5,7 +5,8 @@
 Runs in a scratch folder: the demo first, then page after page in the order in which the commands
 are printed, each page with its own copy of the maps and its own server on the loopback interface.
 ``RULES`` says which commands are only parsed, and which need what is not here; every other command
-runs. A block of JavaScript is saved in the file that its first line names, as its reader does. A
+runs. What docs/extensions.md says that an extension adds is skipped where that one is not here. A
+block of JavaScript is saved in the file that its first line names, as its reader does. A
 line of a shell block that starts with no known program is an error, so blocks that hold no commands
 name their language (```text).
 """
@@ -41,6 +42,7 @@ PAGES = (
     ROOT / "README.md",
     ROOT / "CONTRIBUTING.md",
     *sorted((ROOT / "docs").rglob("*.md")),
+    *sorted(ROOT.glob("visloc_extensions/*/README.md")),
     ROOT / "examples" / "plugin" / "README.md",
 )
 DATA = ROOT.parent / "shared" / "data"
@@ -159,7 +161,7 @@ RULES = (
     Rule(Tier.PARSED, r"examples/plugin", r"", "needs it installed; tests/examples/test_plugin.py"),
     Rule(Tier.PARSED, r"ar-and", r"(mapping import|localize bag)", "needs bags; test_rosbag.py"),
     Rule(Tier.PARSED, r"map-sets", r"mapping (set|split)", _PLACES),
-    Rule(Tier.PARSED, r"mapping\.md", r"mapping capture", "the tutorial runs it"),
+    Rule(Tier.PARSED, r"capture/README", r"mapping capture", "the tutorial runs it"),
     Rule(Tier.PARSED, r"your-app", r"visloc-service .*cors", "test_web_overlay.py"),
     Rule(
         Tier.PARSED,
@@ -198,7 +200,7 @@ RULES = (
     ),
     Rule(Tier.PARSED, r"results|rigs-and|scale\.md|performance", r"", _HOURS),
     Rule(Tier.PARSED, r"operations|decisions", r"(\w+=\S+ )*python -m benchmarks", _HOURS),
-    Rule(Tier.PARSED, r"living-maps|map-sets|mapping\.md", r"python ", _HOURS),
+    Rule(Tier.PARSED, r"living_maps|map-sets|mapping\.md", r"python ", _HOURS),
     Rule(Tier.PARSED, r"models/", r"", "hours of training; tests/training"),
 )
 PROGRAMS = (
@@ -228,6 +230,22 @@ def judged(command: Command) -> Rule:
 
 # Parsing
 
+
+class NotHere(Exception):
+    """The command is of an extension that is not here, which this names."""
+
+
+def absent() -> dict[str, str]:
+    """How the commands begin that extensions add which are not here, and the name of each."""
+    page = (ROOT / "docs" / "extensions.md").read_text(encoding="utf-8")
+    return {
+        command: name
+        for name, adds in re.findall(r"^\| `(\w+)` \| (.*?) \|", page, re.M)
+        for command in re.findall(r"`([^`]+)`", adds)
+        if not (ROOT / "visloc_extensions" / name / "__init__.py").exists()
+    }
+
+
 # typer brings a click of its own, of whose errors it exports this one's children only.
 _UsageError = typer.BadParameter.__mro__[1]
 
@@ -236,6 +254,7 @@ def parse(command: Command) -> None:
     """Parse a command as its program would, without running it; other programs' pass.
 
     Raises:
+        NotHere: an extension adds it.
         ValueError: the program does not take it.
     """
     if command.is_python:
@@ -243,17 +262,25 @@ def parse(command: Command) -> None:
         return
     if command.saved_as:
         return  # node tells when it runs
+    for beginning, name in absent().items():
+        if f"{shlex.join(command.words)} ".startswith(f"{beginning} "):
+            raise NotHere(name)
     program, *arguments = command.words
     if program == "make":
         _parse_make(command)
     parser = _PARSERS.get(program)
     if parser is None:
         return
-    if command.is_inline and arguments[0] == "-m" and len(arguments) == 2:
-        importlib.import_module(arguments[1])  # only named
-        return
     try:
-        parser(arguments)
+        if command.is_inline and arguments[0] == "-m" and len(arguments) == 2:
+            importlib.import_module(arguments[1])  # only named
+        else:
+            parser(arguments)
+    except ModuleNotFoundError as error:  # of a benchmark
+        package, _, name = (error.name or "").partition(".")
+        if package != "visloc_extensions":
+            raise
+        raise NotHere(name.partition(".")[0]) from error
     except _UsageError as error:
         raise ValueError(f"{command.text}: {error}") from error
     except SystemExit as error:
@@ -554,6 +581,8 @@ def checked(command: Command, desk: Desk) -> tuple[str, str]:
             return f"parsed: {absent} is not in ../shared/data", ""
         if rule.tier is Tier.RUN:
             desk.run(command)
+    except NotHere as error:
+        return f"skipped: the extension {error} is not here", ""
     except (CommandFailed, ValueError) as error:
         return rule.tier, str(error)
     return f"{rule.tier}: {rule.reason}" if rule.reason else rule.tier, ""

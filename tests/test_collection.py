@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-TESTS = Path(__file__).resolve().parent
+ROOT = Path(__file__).resolve().parents[1]
+TESTS = (ROOT / "tests", *ROOT.glob("visloc_extensions/*/tests"))
 
 
 def test_every_test_file_is_collected(request: pytest.FixtureRequest, tmp_path: Path) -> None:
@@ -19,6 +20,6 @@ def test_every_test_file_is_collected(request: pytest.FixtureRequest, tmp_path: 
     hidden = tmp_path / ".hidden"
     hidden.mkdir()
     assert ignored(hidden)  # pytest asks this hook about folders, too
-    files = set(TESTS.rglob("test_*.py"))
-    folders = {folder for file in files for folder in file.parents if TESTS in folder.parents}
-    assert not sorted(path for path in {TESTS} | files | folders if ignored(path))
+    files = {file for folder in TESTS for file in folder.rglob("test_*.py")}
+    folders = {folder for file in files for folder in file.parents if ROOT in folder.parents}
+    assert not sorted(path for path in files | folders if ignored(path))

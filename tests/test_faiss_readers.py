@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGES = (
     *("visloc", "mapping", "service", "clients", "samples", "training", "visloc_api"),
-    "benchmarks",
+    *("visloc_extensions", "benchmarks"),
 )
 # Names of faiss's functions and classes that parse what they are given.
 FORBIDDEN_STARTS = ("read_index", "deserialize_", "read_VectorTransform", "read_ProductQuantizer")

@@ -22,7 +22,6 @@ from mapping.pipeline.pairs import PairsJob
 from mapping.pipeline.settings import BuildSettings
 from visloc.geometry import PixelOrigin
 from visloc.options import Fusion, Inference
-from visloc_extensions.living_maps.updating import UpdateSettings
 
 
 def read_by(command: Any, *arguments: str) -> Any:
@@ -51,7 +50,6 @@ def settings_of(kind: type, *arguments: str) -> Any:
     ("arguments", "expected"),
     [
         (("data", "--map", "m"), BuildSettings(Path("data"), "m", workers=DEFAULT_WORKERS)),
-        (("m", "data"), UpdateSettings("m", Path("data"), workers=DEFAULT_WORKERS)),
         (("data", "--output", "p"), PairsJob(Path("data"), Path("p"))),
         (("nvm", "a.nvm"), ImportSettings("nvm", Path("a.nvm"), workers=DEFAULT_WORKERS)),
         (("m",), AnchorSettings("m")),

@@ -16,16 +16,15 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from mapping.cli.main import app as mapping_app
-from mapping.importers import import_dataset, read_model, write_imported
+from mapping.importers import import_dataset, read_model
 from mapping.importers.scans import app_of
 from mapping.stages.depth import read_depth
 from samples.film import encode_video
+from tests.mapping.films.test_video import turned
 from visloc.errors import DatasetError, InvalidInput, VislocError
 from visloc.geometry import Camera, Pose
 from visloc.kapture import Dataset, FileRecord, read_dataset
 from visloc.photos.reading import read_photo_file
-from visloc_extensions.capture.sources import find_sources, read_capture
-from visloc_extensions.capture.tests.test_video import turned
 
 _UPRIGHT = (0, 1, -1, 0)  # the display matrix of a phone held upright
 ARKIT = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -508,24 +507,3 @@ def test_other_folders_are_no_scans(tmp_path: Path, files: dict[str, bytes | str
     for name, content in files.items():
         put(tmp_path / name, content)
     assert app_of(tmp_path) is None
-
-
-@pytest.mark.parametrize("name", WRITERS)
-def test_a_capture_takes_scans_with_their_poses_and_depth(
-    seen: list[Seen], tmp_path: Path, name: str
-) -> None:
-    app, write, _ = WRITERS[name]
-    scan = tmp_path / "of a phone" / name
-    write(scan, seen)
-    sources = find_sources([scan])
-    assert list(sources.exports.values()) == [(app, scan)]
-    assert (sources.videos, sources.folders) == ({}, {})
-    for _ in range(2):  # killed, and called again
-        model = read_capture(sources, {}, tmp_path / "work", lambda *_: None)
-    assert model.metric
-    assert all(image.cam_from_world is not None for image in model.images)
-    assert all((image.depth is None) == (app == "record3d") for image in model.images)
-    write_imported(model, tmp_path / "dataset")
-    dataset = read_dataset(tmp_path / "dataset")
-    assert all(dataset.has_file(record) for record in (*dataset.images, *dataset.depth_maps))
-    assert [path.name for path in scan.parent.iterdir()] == [name]  # nothing was written beside it

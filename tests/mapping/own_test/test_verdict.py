@@ -24,7 +24,6 @@ from visloc.archive.schema import Doubt
 from visloc.errors import Conflict, InvalidInput, NotFound
 from visloc.geometry import Pose
 from visloc.kapture import read_dataset, write_dataset
-from visloc_extensions.living_maps.merging import merge_maps
 
 
 def ran(tested: int, refused: int, wrong: int) -> OwnTestRun:
@@ -251,14 +250,10 @@ def test_nothing_is_made_of_a_version_in_doubt_until_it_is_accepted(
     broken: Path, maps_dir: Path
 ) -> None:
     store = MapStore(maps_dir)
-    good = store.current_version("room")
     ref = f"room@{build(broken, maps_dir).manifest.version}"
 
     with pytest.raises(Conflict) as caught:
         split_map(store, ref, "tiles", lambda *_: None, tile=100.0, overlap=0.0)
-    assert caught.value.code == "map.doubtful"
-    with pytest.raises(Conflict) as caught:
-        merge_maps(store, f"room@{good}", ref, "both", lambda *_: None)
     assert caught.value.code == "map.doubtful"
     assert store.ids() == ["room"]
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from mapping.methods.sfm_settings import SfmSettings
-from visloc.archive import Map, MapStore, verify_map
+from visloc.archive import Map, MapStore
 from visloc.errors import DatasetError, InvalidInput, VislocError
 from visloc.evaluation import pose_error
 from visloc.features import make_local_features
-from visloc.geometry import Camera, PixelOrigin, Pose
+from visloc.geometry import Camera, PixelOrigin
 from visloc.kapture import (
     open_features,
     open_local_features,
@@ -26,7 +26,6 @@ from visloc.localization.localizer import Localizer
 from visloc.options import LocalizeOptions
 from visloc.photos.reading import read_photo_file
 from visloc.types import LocalFeatures, Localized, QueryFeatures
-from visloc_extensions.living_maps.updating import UpdateSettings, update_map
 
 Build = Callable[..., Map]
 Rewrite = Callable[..., None]
@@ -332,24 +331,3 @@ def test_a_published_dataset_is_mapped_and_queried_by_its_own_features(
     # 4 to 9 mm and 0.04 to 0.18 degrees, in a hall of 500 keypoints per photo
     assert np.max(errors, axis=0)[0] < 0.03
     assert np.max(errors, axis=0)[1] < 0.4
-
-
-def test_a_capture_of_features_alone_joins_a_map_of_such(
-    described: Path, tmp_path: Path, build_walk: Build, rewrite: Rewrite
-) -> None:
-    images = read_dataset(described).images
-    for name, odd in (("first", False), ("second", True)):
-        shutil.copytree(described, tmp_path / name)
-        own = tuple(image for image in images if (image.timestamp // 1000 % 2 == 1) == odd)
-        rewrite(tmp_path / name, images=own)
-    before = build_walk(tmp_path / "first", tmp_path / "maps", **KINDS)
-    settings = UpdateSettings("walk", tmp_path / "second", tmp_path / "maps")
-    after = verify_map(update_map(settings, lambda *_: None).folder)
-
-    assert (len(before.images), len(after.images)) == (8, 16)
-    assert after.manifest.local_features == before.manifest.local_features
-    truth = {image.path: read_dataset(described).pose(image) for image in images}
-    for image, row in zip(after.images, after.image_poses, strict=True):
-        pose = truth[image.name]
-        assert pose is not None
-        assert pose_error(Pose.from_quaternion(row[:4], row[4:]), pose)[0] < 0.02

@@ -36,7 +36,6 @@ from visloc.localization.localizer import Localizer
 from visloc.options import Inference, LocalizeOptions, ReadAs
 from visloc.photos.reading import read_photo, read_photo_file, turn_of
 from visloc.types import Localized
-from visloc_extensions.living_maps.updating import UpdateSettings, update_map
 
 SIZE = (256, 192)
 
@@ -163,25 +162,6 @@ def test_queries_in_any_orientation_are_localized_in_it(
     assert answer.evidence.num_inliers == pytest.approx(straight.evidence.num_inliers, rel=0.02)
     truth = turned_pose(query.cam_from_world, orientation)
     assert pose_error(answer.cam_from_world, truth) < (0.003, 0.1)
-
-
-def test_a_turned_capture_joins_a_map_of_upright_photos(
-    built_maps: Path, turned_sample: Path, orientations: Mapping[str, int], tmp_path: Path
-) -> None:
-    maps = Path(shutil.copytree(built_maps, tmp_path / "maps"))
-    settings = UpdateSettings("room", turned_sample, maps, capture="again")
-    done = update_map(settings, quiet)
-    opened = MapStore(maps).open("room")
-
-    assert done.record.tied == done.record.photos == 8
-    dataset = read_dataset(turned_sample)
-    truth = {record.path: dataset.pose(record) for record in dataset.images}
-    for image, row in list(zip(opened.images, opened.image_poses, strict=True))[8:]:
-        name = image.name.removeprefix("again/")
-        assert image.turn == turn_of(orientations[name])
-        pose = truth[name]
-        assert pose is not None
-        assert pose_error(Pose.from_quaternion(row[:4], row[4:]), pose) < (0.01, 0.1)
 
 
 @pytest.mark.parametrize("orientation", [5, 6, 7, 8])

@@ -11,11 +11,11 @@ from PIL import Image
 
 from mapping.importers import write_imported
 from mapping.stages.work_folder import WorkFolder
+from tests.mapping.films.conftest import panned
 from visloc.errors import DatasetError, InvalidInput, NotFound
 from visloc.kapture import read_dataset
 from visloc_extensions.capture.frames import study_video, write_photos
 from visloc_extensions.capture.sources import find_sources, read_capture, study_videos
-from visloc_extensions.capture.tests.conftest import panned
 
 MakeVideo = Callable[..., Path]
 

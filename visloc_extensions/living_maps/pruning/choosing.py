@@ -5,7 +5,7 @@ a query near any photo be localized (Li et al. 2010, Cao and Snavely 2014). Obse
 from the cells of a photo in turn, so that they are spread over it. Within a cell the choice is
 random, except that landmarks that two other photos have kept already come last. Preferring
 landmarks that many photos see lost queries, because those lie close together and a query matches
-each of them only once (docs/living-maps.md).
+each of them only once (README.md of this extension).
 """
 
 from __future__ import annotations

@@ -18,6 +18,7 @@ from mapping.pipeline.build import build_map
 from mapping.pipeline.settings import BuildSettings
 from mapping.sample import write_sample
 from mapping.stages.work_folder import exclusive
+from tests.mapping.own_test.test_verdict import build as build_room
 from visloc.archive import Anchor, Geodetic, Map, MapStore, SetOutline
 from visloc.errors import Conflict, InvalidInput
 from visloc.geometry import Pose, Similarity, rotation_angle
@@ -203,6 +204,17 @@ def test_too_little_overlap_is_refused(halves: MapStore) -> None:
         merge_maps(halves, "sighted", "blind", "too-little", quiet, min_overlap=0.95)
 
     assert error.value.code == "merge.overlap"
+
+
+def test_a_version_in_doubt_is_not_merged(broken: Path, maps_dir: Path) -> None:
+    store = MapStore(maps_dir)
+    good = store.current_version("room")
+    ref = f"room@{build_room(broken, maps_dir).manifest.version}"
+
+    with pytest.raises(Conflict) as caught:
+        merge_maps(store, f"room@{good}", ref, "both", quiet)
+    assert caught.value.code == "map.doubtful"
+    assert store.ids() == ["room"]
 
 
 def test_what_cannot_be_merged(halves: MapStore) -> None:

@@ -16,10 +16,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
 from mapping.cli import main as cli
+from mapping.cluster.workers import DEFAULT_WORKERS
 from mapping.maps.editing import content_of
 from mapping.own_test.publishing import publish_edited
 from mapping.own_test.trials import own_test
 from mapping.sample import write_sample
+from tests.mapping.cli.test_from_settings import settings_of
 from visloc.archive import Map, MapStore, open_map, verify_map
 from visloc.errors import Conflict, VislocError
 from visloc.evaluation import pose_error
@@ -541,6 +543,13 @@ def test_settings_that_mean_nothing_are_refused(
     changes: dict[str, object], code: str, captures: Path, maps_dir: Path
 ) -> None:
     assert refused(captures / "second", maps_dir, **changes).code == code
+
+
+def test_options_left_out_give_the_defaults(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("MAPS_DIR", "WEIGHTS_DIR"):
+        monkeypatch.delenv(f"VISLOC_{name}", raising=False)
+    expected = UpdateSettings("m", Path("data"), workers=DEFAULT_WORKERS)
+    assert settings_of(UpdateSettings, "m", "data") == expected
 
 
 def test_the_command_says_how_many_photos_were_tied_and_how_well(

@@ -1,12 +1,10 @@
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from mapping.cluster.workers import Workers
-from mapping.own_test.held_out import HeldOut, Within, tolerance_of
+from mapping.own_test.held_out import HeldOut, tolerance_of
 from mapping.stages.work_folder import WorkFolder
 from visloc.geometry import Camera
 from visloc.localization.map_view.constraints import MapGeometry
@@ -159,33 +157,6 @@ def test_the_standard_deviation_learns_how_large_errors_are():
     precision = fit_precision(outlooks, errors, 0.25)
     assert precision.std(Outlook(300.0, 0.004, 0.3)) == pytest.approx(0.016, rel=0.2)
     assert precision.std(Outlook(2.0, np.inf, 0.3)) == np.inf
-
-
-@pytest.mark.parametrize(
-    ("scale", "metric", "of_reach"),
-    [(1.0, True, None), (1.0, False, 0.05), (1 / 60, True, 0.2), (800.0, True, 0.01)],
-)
-def test_a_tolerance_is_25_cm_within_shares_of_what_is_seen_in_metric_maps(
-    make_map, looking, room, scale, metric, of_reach
-):
-    poses = [looking((0.0, 0.0, 0.0), 90.0 * i) for i in range(3)]
-    opened = make_map(room(np.random.default_rng(0), 400), poses, metric=metric)
-    viewpoints = MapGeometry(opened).viewpoints
-    viewpoints = replace(viewpoints, reach=scale * viewpoints.reach)
-    expected = 0.25 if of_reach is None else of_reach * viewpoints.reach
-    assert tolerance_of(opened, viewpoints) == Within(expected, 2.0)
-
-
-def test_a_run_is_judged_by_position_and_orientation():
-    def run(position, orientation):
-        nothing = np.empty(0, dtype=np.int64)
-        return HeldOut(0, nothing, "", position, orientation, 9, nothing, np.empty(0))
-
-    within = Within(0.25, 2.0)
-    assert within.holds(run(0.25, 2.0))
-    assert not within.holds(run(0.26, 0.0))
-    assert not within.holds(run(0.0, 2.1))
-    assert not within.holds(run(np.inf, np.inf))
 
 
 @pytest.fixture(scope="module")

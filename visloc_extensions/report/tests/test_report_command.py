@@ -13,10 +13,10 @@ import pytest
 
 from mapping.cli import main as cli
 from mapping.stages.work_folder import exclusive
-from visloc.archive import MapStore
-from visloc.errors import Unavailable
+from visloc.archive import Map, MapStore
+from visloc.errors import Conflict, Unavailable
 from visloc_extensions.report import command
-from visloc_extensions.report.command import MAX_POINTS, summary_of_report
+from visloc_extensions.report.command import MAX_POINTS, summary_of_report, write_report
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -302,6 +302,14 @@ def test_a_map_of_one_photo_has_a_summary() -> None:
     summary = summary_of_report(_data(held_out=[], coverage=empty))
     assert summary["held_out"] == 0
     assert summary["likely"] is None
+
+
+def test_a_map_without_landmarks_is_refused(bare: Map, tmp_path: Path) -> None:
+    with pytest.raises(Conflict) as caught:
+        write_report(
+            *(bare, tmp_path / "r.html", tmp_path), workers=1, command="", progress=lambda *_: None
+        )
+    assert caught.value.code == "map.no_landmarks"
 
 
 def test_a_real_map_is_reported_on_with_numbers_that_hold_together(

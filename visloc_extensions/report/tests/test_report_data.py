@@ -184,17 +184,6 @@ def test_a_guess_of_what_is_up_is_told_as_such(make_map, looking, tmp_path, axes
         assert data["up"]["direction"] == [0.0, 0.0, 1.0]
 
 
-def test_up_is_a_direction_even_where_no_row_tells_which_way_round(make_map):
-    # Rows level and upper edges at right angles to what is most nearly level.
-    axes = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
-    poses = [Pose(turn @ axes, np.zeros(3)) for turn in (np.eye(3), np.diag([-1.0, 1, -1]))]
-    points = np.random.default_rng(0).uniform(-3, 3, (400, 3))
-    opened = make_map(points, poses, gravity=None)
-    plan = Plan.of(opened, MapGeometry(opened).viewpoints)
-    for axis in (plan.up, plan.right, plan.ahead):
-        assert np.linalg.norm(axis) == pytest.approx(1.0)
-
-
 @pytest.mark.parametrize(("step", "digits"), [(3.0, 0), (0.3, 1), (0.01, 2), (2e-7, 7), (50.0, 0)])
 def test_digits_tell_a_step_apart(step, digits):
     assert decimals_of(step) == digits
@@ -209,41 +198,6 @@ def test_places_of_a_small_world_keep_their_digits(make_map, looking, room, tmp_
     data, _ = report_of(make_map(points, poses, metric=False, nearest=0.1 * size), tmp_path)
     assert data["images"][1]["position"][0] == pytest.approx(0.5 * size, rel=1e-3)
     assert len({tuple(cell["position"]) for cell in data["coverage"]["cells"]}) > 10
-
-
-def test_without_gravity_up_is_that_of_the_cameras(make_map, looking, room):
-    points = room(np.random.default_rng(0), 200)
-    opened = make_map(points, [looking((0, 0, 0), 40.0 * i) for i in range(3)], gravity=None)
-    plan = Plan.of(opened, MapGeometry(opened).viewpoints)
-    assert plan.up_source == "cameras"
-    assert plan.up == pytest.approx([0.0, 0.0, 1.0], abs=1e-9)
-    assert np.cross(plan.right, plan.ahead) == pytest.approx(plan.up)
-    assert plan.pitch_deg == pytest.approx(0.0, abs=1e-6)
-
-
-@pytest.mark.parametrize("quarter_turns", [0, 1, 2, 3])
-def test_the_plan_holds_the_camera_as_the_mapping_photos_did(
-    make_map, looking, room, quarter_turns
-):
-    turn = np.linalg.matrix_power(np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]]), quarter_turns)
-    poses = []
-    for yaw in (0.0, 30.0, 60.0):
-        level = looking((0, 0, 0), yaw)
-        poses.append(type(level)(turn @ level.rotation, turn @ level.translation))
-    opened = make_map(room(np.random.default_rng(0), 800), poses)
-    plan = Plan.of(opened, MapGeometry(opened).viewpoints)
-    made = plan.pose(np.zeros(3), 30.0)
-    assert made.rotation == pytest.approx(poses[1].rotation, abs=1e-9)
-    assert np.linalg.det(made.rotation) == pytest.approx(1.0)
-
-
-def test_a_pose_of_the_plan_looks_where_it_says(make_map, looking, room):
-    opened = make_map(room(np.random.default_rng(0), 200), [looking((0, 0, 0), 0.0)])
-    plan = Plan.of(opened, MapGeometry(opened).viewpoints)
-    position = np.array([1.0, 2.0, 0.3])
-    pose = plan.pose(position, 90.0)
-    assert pose.center == pytest.approx(position)
-    assert pose.rotation[2] == pytest.approx(plan.ahead)
 
 
 def test_the_grid_stays_near_the_photos_and_at_their_height(half_mapped_room):

@@ -11,8 +11,8 @@ import pytest
 
 from mapping.films import video
 from mapping.films.video import frames_of, is_video, video_facts
+from tests.mapping.films.conftest import Picture, panned
 from visloc.errors import InvalidInput, TooLarge
-from visloc_extensions.capture.tests.conftest import Picture, panned
 
 MakeVideo = Callable[..., Path]
 # tkhd's matrix, rows (a, b, u), (c, d, v), (x, y, w): p' = (a x + c y, b x + d y), y down.
