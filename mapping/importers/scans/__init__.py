@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from visloc.errors import refuse
-
 _CAMERAS = ("corrected_cameras/*.json", "cameras/*.json")
 # Importer -> where its cameras and poses are, and words that these files have.
 _APPS: Mapping[str, tuple[tuple[str, ...], tuple[bytes, ...]]] = {
@@ -37,13 +35,3 @@ def _has_words(path: Path, words: tuple[bytes, ...]) -> bool:
     except OSError:
         return False
     return all(word in text for word in words)
-
-
-def refuse_scan(path: Path) -> None:
-    """Refuse the scan of an app where photos or a dataset are expected.
-
-    Raises:
-        InvalidInput: ``import.scan``.
-    """
-    if (app := app_of(path)) is not None:
-        raise refuse("import.scan", field=str(path), app=app, path=path)
