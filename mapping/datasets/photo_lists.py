@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mapping.datasets.text import read_lines
-from mapping.importers.reading.tracks import pose_from_center
+from mapping.importers.reading.poses import pose_from_center
 from visloc.errors import DatasetError, InvalidInput, refuse
 from visloc.geometry import Camera, Pose
 from visloc.kapture import Dataset, FileRecord, Sensor

@@ -24,8 +24,9 @@ from mapping.importers.largest import ModelSize, largest_model
 from mapping.importers.model import ImportedImage, ImportedModel
 from mapping.importers.reading.centered import kept_measurements, note_on_absent, with_measurements
 from mapping.importers.reading.photo_names import photo_names, photo_size
+from mapping.importers.reading.poses import pose_from_center, rotation_from_matrix
 from mapping.importers.reading.text_lines import TextLines
-from mapping.importers.reading.tracks import Measurements, pose_from_center, rotation_from_matrix
+from mapping.importers.reading.tracks import Measurements
 from visloc.errors import InvalidInput, refuse
 from visloc.geometry import Camera, Pose
 from visloc.kapture import Sensor

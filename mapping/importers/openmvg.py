@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from mapping.importers.model import ImportedImage, ImportedModel
 from mapping.importers.reading.json_fields import JsonValue, notes_on_unread, read_json
 from mapping.importers.reading.photo_names import photo_names
-from mapping.importers.reading.tracks import Measurements, pose_from_center, rotation_from_matrix
+from mapping.importers.reading.poses import pose_from_center, rotation_from_matrix
+from mapping.importers.reading.tracks import Measurements
 from mapping.importers.regions import PIXELS, with_features
 from visloc.errors import DatasetError, InvalidInput, refuse
 from visloc.geometry import MAX_IMAGE_SIDE, Camera, Pose

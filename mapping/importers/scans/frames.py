@@ -20,7 +20,7 @@ from mapping.importers.dataset import depth_sensor_id
 from mapping.importers.left_out import notes_on
 from mapping.importers.model import ImportedImage, ImportedModel
 from mapping.importers.reading.photo_names import photo_size
-from mapping.importers.reading.tracks import has_moved, pose_from_center, rotation_from_matrix
+from mapping.importers.reading.poses import has_moved, pose_from_center, rotation_from_matrix
 from mapping.stages.depth import DEFAULT_DEPTH_SCALE, MAX_DEPTH_PIXELS, read_depth
 from visloc.errors import DatasetError, InvalidInput, VislocError, refuse
 from visloc.geometry import Camera, Pose
