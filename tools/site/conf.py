@@ -16,7 +16,10 @@ author = "the visloc authors"
 release = visloc.__version__
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton"]
 source_suffix = {".md": "markdown"}
-include_patterns = ["*.md", "docs/**", "examples/plugin/README.md", "web/client/README.md"]
+include_patterns = [
+    *("*.md", "docs/**", "visloc_extensions/*/README.md"),
+    *("examples/plugin/README.md", "web/client/README.md"),
+]
 exclude_patterns = ["maps"]
 root_doc = "docs/index"
 html_theme = "furo"
