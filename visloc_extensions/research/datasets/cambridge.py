@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
-from mapping.datasets.text import read_lines
 from visloc.errors import DatasetError, InvalidInput, refuse
 from visloc.geometry import Camera, Pose
 from visloc.kapture import Dataset, FileRecord, Sensor
+from visloc_extensions.research.datasets.text import read_lines
 
 _SPLITS = {"mapping": "dataset_train.txt", "query": "dataset_test.txt"}
 _NVM = "reconstruction.nvm"

@@ -19,10 +19,10 @@ from pathlib import Path
 
 import numpy as np
 
-from mapping.datasets.text import read_lines
 from visloc.errors import refuse
 from visloc.geometry import Camera, Pose
 from visloc.kapture import Dataset, FileRecord, Sensor
+from visloc_extensions.research.datasets.text import read_lines
 
 _SPLITS = {"mapping": "TrainSplit.txt", "query": "TestSplit.txt"}
 _ONE_SCENE = "lines such as sequence1, in the folder of one scene"

@@ -11,10 +11,10 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from mapping.datasets import write_parts
 from visloc.errors import DatasetError, InvalidInput
 from visloc.geometry import Camera, Pose
 from visloc.kapture import Dataset, read_dataset
+from visloc_extensions.research.datasets import write_parts
 
 DAY, NIGHT = "query/day/milestone/a.jpg", "query/night/nexus5x/b.jpg"
 DATABASE = ("db/1.jpg", "db/2.jpg")

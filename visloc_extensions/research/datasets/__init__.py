@@ -6,14 +6,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from mapping.datasets.aachen import read_aachen, read_aachen_v1_1
-from mapping.datasets.cambridge import read_cambridge
-from mapping.datasets.cmu import read_cmu
-from mapping.datasets.robotcar import read_robotcar
-from mapping.datasets.seven_scenes import read_seven_scenes
 from mapping.stages.outputs import complete_output
 from visloc.errors import refuse
 from visloc.kapture import Dataset, write_dataset
+from visloc_extensions.research.datasets.aachen import read_aachen, read_aachen_v1_1
+from visloc_extensions.research.datasets.cambridge import read_cambridge
+from visloc_extensions.research.datasets.cmu import read_cmu
+from visloc_extensions.research.datasets.robotcar import read_robotcar
+from visloc_extensions.research.datasets.seven_scenes import read_seven_scenes
 
 # The parts of a data set by name, such as mapping and query; root is the folder of the photos.
 Reader = Callable[[Path], Mapping[str, Dataset]]

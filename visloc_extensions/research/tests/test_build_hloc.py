@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 import pytest
 
-from mapping.importers.hloc import import_features
 from visloc.archive import Map
 from visloc.errors import DatasetError, InvalidInput
 from visloc.evaluation import pose_error
@@ -36,6 +35,7 @@ from visloc.options import LocalizeOptions
 from visloc.photos.reading import read_photo_file
 from visloc.pose.colmap import project
 from visloc.types import LocalFeatures, Localized, QueryFeatures
+from visloc_extensions.research.hloc import import_features
 
 h5py = pytest.importorskip("h5py", reason="h5py is not installed: the extra hloc")
 

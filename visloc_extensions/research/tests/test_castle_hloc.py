@@ -11,7 +11,6 @@ import pytest
 from clients.evaluation.queries import Query
 from clients.evaluation.readers import FeatureReader
 from clients.evaluation.sent_matches import PhotoMatches
-from mapping.importers.hloc import import_features
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.pipeline.build import build_map
 from mapping.pipeline.settings import BuildSettings
@@ -28,6 +27,7 @@ from visloc.matching.products import round_descriptors
 from visloc.options import LocalizeOptions
 from visloc.photos.reading import read_photo_file
 from visloc.types import Localized
+from visloc_extensions.research.hloc import import_features
 
 h5py = pytest.importorskip("h5py", reason="h5py is not installed: the extra hloc")
 

@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mapping.maps.export_features import export_features
+from tests.turning import store_photo_turned, turned_points
 from visloc.archive import MapStore
 from visloc.errors import Conflict
 from visloc.features import make_global_descriptor, make_local_features
-from visloc.kapture import read_dataset
+from visloc.geometry import PixelOrigin
+from visloc.kapture import open_local_features, read_dataset, read_local
 from visloc.options import Inference
 from visloc.photos.reading import read_photo_file
+from visloc_extensions.research.export_features import export_features
 
 SIFT_DIM = 128
 
@@ -191,3 +193,16 @@ def test_photos_that_are_absent_are_told_and_passed_over(sample: Path, tmp_path:
     assert absent == ["query/left/0002.jpg"]
     assert steps[-1] == ("features", 3, 3)
     assert len(list((tmp_path / "out" / "reconstruction").rglob("*.desc"))) == 2
+
+
+def test_features_of_turned_photos_are_in_stored_pixels(sample: Path, tmp_path: Path) -> None:
+    dataset = Path(shutil.copytree(sample / "mapping", tmp_path / "dataset"))
+    photo = dataset / "sensors" / "records_data" / "mapping" / "left" / "0001.jpg"
+    store_photo_turned(photo, 3)  # of the same size
+    size, keypoints = (256, 192), []
+    for name, source in (("turned", dataset), ("straight", sample / "mapping")):
+        export(source, tmp_path / name, max_keypoints=500)
+        sets = open_local_features(tmp_path / name, "sift", None)
+        rows = read_local(*sets, "mapping/left/0001.jpg", size, PixelOrigin.CORNER)
+        keypoints.append(rows[0])
+    np.testing.assert_allclose(keypoints[0], turned_points(keypoints[1], size, 3), atol=1e-3)

@@ -15,11 +15,11 @@ import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from mapping.datasets.photo_lists import check_photos, read_cameras, read_centers
-from mapping.datasets.text import read_lines
 from visloc.errors import refuse
 from visloc.geometry import Camera, Pose
 from visloc.kapture import Dataset, FileRecord, Sensor
+from visloc_extensions.research.datasets.photo_lists import check_photos, read_cameras, read_centers
+from visloc_extensions.research.datasets.text import read_lines
 
 _NAME = re.compile(r"img_\d+_(c\d+)_(\d{1,18})us(?:_rect)?\.jpg")
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mapping.datasets import write_parts
 from visloc.errors import Conflict, DatasetError, InvalidInput
 from visloc.geometry import Pose
 from visloc.kapture import read_dataset
+from visloc_extensions.research.datasets import write_parts
 
 TRUTH = Pose.from_quaternion((0.9, 0.1, -0.3, 0.2), (1.0, -2.0, 0.5))  # world_from_depth
 

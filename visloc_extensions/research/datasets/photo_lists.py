@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from mapping.datasets.text import read_lines
 from mapping.importers.reading.poses import pose_from_center
 from visloc.errors import DatasetError, InvalidInput, refuse
 from visloc.geometry import Camera, Pose
 from visloc.kapture import Dataset, FileRecord, Sensor
 from visloc.kapture.text import relative_path
+from visloc_extensions.research.datasets.text import read_lines
 
 
 def read_cameras(path: Path) -> dict[str, Camera]:

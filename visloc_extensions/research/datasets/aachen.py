@@ -13,10 +13,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from mapping.datasets.photo_lists import check_photos, read_cameras, with_own_cameras
 from mapping.importers import colmap, nvm
 from visloc.errors import refuse
 from visloc.kapture import Dataset, FileRecord
+from visloc_extensions.research.datasets.photo_lists import (
+    check_photos,
+    read_cameras,
+    with_own_cameras,
+)
 
 _MODELS, _QUERIES = "3D-models", "queries"
 _LISTS = ("day_time_queries_with_intrinsics.txt", "night_time_queries_with_intrinsics.txt")

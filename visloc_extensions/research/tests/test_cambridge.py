@@ -10,10 +10,10 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from mapping.datasets import write_parts
 from visloc.errors import DatasetError
 from visloc.geometry import Camera
 from visloc.kapture import read_dataset
+from visloc_extensions.research.datasets import write_parts
 
 HEADING = "Visual Landmark Dataset V1\nImageFile, Camera Position [X Y Z W P Q R]\n\n"
 PHOTOS = ("seq1/frame00001.png", "seq1/frame00002.png", "seq3/frame00001.png")
