@@ -13,9 +13,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from mapping.importers import colmap, nvm
+from mapping.importers import colmap
 from visloc.errors import refuse
 from visloc.kapture import Dataset, FileRecord
+from visloc_extensions.importers import nvm
 from visloc_extensions.research.datasets.photo_lists import (
     check_photos,
     read_cameras,

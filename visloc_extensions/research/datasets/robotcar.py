@@ -13,10 +13,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from mapping.importers import nvm
 from visloc.errors import DatasetError, InvalidInput, refuse
 from visloc.geometry import Camera, Pose
 from visloc.kapture import Dataset, FileRecord, Sensor
+from visloc_extensions.importers import nvm
 from visloc_extensions.research.datasets.photo_lists import check_photos
 from visloc_extensions.research.datasets.text import read_lines
 

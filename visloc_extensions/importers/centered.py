@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.importers.model import ImportedImage, ImportedModel
-from mapping.importers.reading.tracks import Measurements, keypoints_of, projections
 from visloc.errors import refuse
 from visloc.kapture import Sensor
+from visloc_extensions.importers.tracks import Measurements, keypoints_of, projections
 
 # A measurement agrees with a camera if the point projects this near to it, in image diagonals.
 # Reconstructions keep far better ones only; a wrong origin is off by half a diagonal.

@@ -8,10 +8,10 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from mapping.importers.nvm import read
-from mapping.importers.reading.tracks import reprojection_errors
 from visloc.errors import DatasetError
 from visloc.geometry import Pose
+from visloc_extensions.importers.nvm import read
+from visloc_extensions.importers.tracks import reprojection_errors
 
 SIZE = (640, 480)
 FOCAL = 500.0

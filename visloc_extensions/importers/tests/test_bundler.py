@@ -9,10 +9,10 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from mapping.importers import nvm
-from mapping.importers.bundler import read
-from mapping.importers.reading.tracks import reprojection_errors
 from visloc.errors import DatasetError
+from visloc_extensions.importers import nvm
+from visloc_extensions.importers.bundler import read
+from visloc_extensions.importers.tracks import reprojection_errors
 
 SIZE = (640, 480)
 NAMES = ("a.jpg", "b.jpg", "c.jpg")

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mapping.importers.opensfm import read
-from mapping.importers.reading.tracks import reprojection_errors
 from visloc.errors import DatasetError
 from visloc.geodesy import geodetic_from_enu
 from visloc.pose.colmap import project
+from visloc_extensions.importers.opensfm import read
+from visloc_extensions.importers.tracks import reprojection_errors
 
 POINTS = np.array([[0.1, -0.2, 3.0], [0.5, 0.3, 4.0], [-0.6, 0.2, 2.5], [0.9, 0.7, 3.5]])
 PERSPECTIVE = {

@@ -1,4 +1,7 @@
-"""Scans of phones with poses of ARKit, as apps write them; here: whose scan a folder is."""
+"""Importers of scans of phones with poses of ARKit, as apps write them.
+
+Here: whose scan a folder is, which keeps it from being taken for photos or a dataset.
+"""
 
 from __future__ import annotations
 

@@ -22,15 +22,19 @@ import numpy as np
 
 from mapping.importers.largest import ModelSize, largest_model
 from mapping.importers.model import ImportedImage, ImportedModel
-from mapping.importers.reading.centered import kept_measurements, note_on_absent, with_measurements
 from mapping.importers.reading.photo_names import photo_names, photo_size
 from mapping.importers.reading.poses import pose_from_center, rotation_from_matrix
 from mapping.importers.reading.text_lines import TextLines
-from mapping.importers.reading.tracks import Measurements
 from visloc.errors import InvalidInput, refuse
 from visloc.geometry import Camera, Pose
 from visloc.kapture import Sensor
 from visloc.kapture.dataset import UNKNOWN_CAMERA
+from visloc_extensions.importers.centered import (
+    kept_measurements,
+    note_on_absent,
+    with_measurements,
+)
+from visloc_extensions.importers.tracks import Measurements
 
 _MAX_COUNT = 10**9
 _MIN_FOCAL = 1e-3  # pixels; powers of what is below overflow in 1 / f

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mapping.importers.openmvg import read
-from mapping.importers.reading.tracks import reprojection_errors
+from mapping.importers import read_model
 from visloc.errors import DatasetError
 from visloc.pose.colmap import project
+from visloc_extensions.importers.openmvg import read
+from visloc_extensions.importers.tracks import reprojection_errors
 
 POINTS = np.array([[0.1, -0.2, 3.0], [0.5, 0.3, 4.0], [-0.6, 0.2, 2.5], [0.9, 0.7, 3.5]])
 FIRST_USE = 2**31
@@ -418,3 +419,21 @@ def test_absolute_names_that_end_alike_are_refused(tmp_path: Path) -> None:
 
     with pytest.raises(DatasetError, match="two photos have the name 'a\\.jpg'"):
         read(write(tmp_path, content))
+
+
+@pytest.mark.parametrize(
+    ("reader", "top", "named"),
+    [
+        ("openmvg", {"frames": []}, "mapping import nerfstudio"),
+        ("openmvg", {"version": [], "matchesFolders": [], "views": []}, "aliceVision_exportColmap"),
+        ("opensfm", {"version": [], "featuresFolders": [], "views": []}, "Meshroom"),
+        ("opensfm", {"frames": []}, "mapping import nerfstudio"),
+    ],
+)
+def test_a_file_of_another_program_is_recognized(
+    tmp_path: Path, reader: str, top: Any, named: str
+) -> None:
+    (tmp_path / "cameras.sfm").write_text(json.dumps(top))
+    with pytest.raises(DatasetError, match=named) as caught:
+        read_model(reader, tmp_path / "cameras.sfm")
+    assert caught.value.code == "import.json"

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from mapping.importers.model import ImportedImage
 from mapping.importers.reading.json_fields import read_json
 from mapping.importers.reading.text_lines import TextLines
-from mapping.importers.reading.tracks import Measurements, keypoints_of
 from visloc.errors import refuse
 from visloc.geometry import PixelOrigin
+from visloc_extensions.importers.tracks import Measurements, keypoints_of
 
 PIXELS = PixelOrigin.CENTER  # where OpenMVG counts from
 # Positions in .feat files are rounded to six digits; those of another extraction are not near.

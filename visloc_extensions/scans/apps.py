@@ -30,7 +30,12 @@ from mapping.importers import nerfstudio
 from mapping.importers.reading.json_fields import JsonValue, parse_json, read_json
 from mapping.importers.reading.photo_names import natural_order, photo_names, photo_size
 from mapping.importers.reading.text_lines import TextLines
-from mapping.importers.scans.frames import (
+from mapping.stages.depth import read_depth
+from visloc.errors import refuse
+from visloc.geometry import MAX_IMAGE_SIDE, Camera
+from visloc.photos.formats import MALFORMED, png_samples
+from visloc.photos.reading import FILE_LIMITS
+from visloc_extensions.scans.frames import (
     OURS_FROM_ARKIT,
     ScanFrame,
     arkit_pose,
@@ -41,11 +46,6 @@ from mapping.importers.scans.frames import (
     starts_of_stretches,
     unused,
 )
-from mapping.stages.depth import read_depth
-from visloc.errors import refuse
-from visloc.geometry import MAX_IMAGE_SIDE, Camera
-from visloc.photos.formats import MALFORMED, png_samples
-from visloc.photos.reading import FILE_LIMITS
 
 _INTRINSICS, _SIZE = ("fx", "fy", "cx", "cy"), ("width", "height")
 

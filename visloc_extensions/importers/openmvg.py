@@ -21,12 +21,12 @@ from mapping.importers.model import ImportedImage, ImportedModel
 from mapping.importers.reading.json_fields import JsonValue, notes_on_unread, read_json
 from mapping.importers.reading.photo_names import photo_names
 from mapping.importers.reading.poses import pose_from_center, rotation_from_matrix
-from mapping.importers.reading.tracks import Measurements
-from mapping.importers.regions import PIXELS, with_features
 from visloc.errors import DatasetError, InvalidInput, refuse
 from visloc.geometry import MAX_IMAGE_SIDE, Camera, Pose
 from visloc.kapture import Sensor
 from visloc.kapture.dataset import UNKNOWN_CAMERA
+from visloc_extensions.importers.regions import PIXELS, with_features
+from visloc_extensions.importers.tracks import Measurements
 
 _UNDEFINED = 2**32 - 1  # an id that refers to nothing
 _FIRST_USE = 2**31  # set in cereal's numbers where the name or the data follow

@@ -22,16 +22,16 @@ from scipy.spatial.transform import Rotation
 from mapping.frames.anchor import scale_doubt
 from mapping.importers.largest import ModelSize, largest_model
 from mapping.importers.model import ImportedImage, ImportedModel
-from mapping.importers.opensfm_features import Features, read_features
 from mapping.importers.reading.json_fields import JsonValue, notes_on_unread, read_json
 from mapping.importers.reading.photo_names import photo_names
 from mapping.importers.reading.text_lines import TextLines
-from mapping.importers.reading.tracks import Measurements, keypoints_of
 from visloc.errors import DatasetError, InvalidInput, refuse
 from visloc.geodesy import geodetic_from_enu
 from visloc.geometry import MAX_IMAGE_SIDE, Camera, Pose
 from visloc.kapture import GnssRecord, Sensor
 from visloc.kapture.text import is_field
+from visloc_extensions.importers.opensfm_features import Features, read_features
+from visloc_extensions.importers.tracks import Measurements, keypoints_of
 
 _GNSS = "gnss"
 # What OpenSfM writes for an altitude that it was told not to use, its default.

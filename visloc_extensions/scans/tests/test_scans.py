@@ -17,15 +17,14 @@ from typer.testing import CliRunner
 
 from mapping.cli.main import app as mapping_app
 from mapping.importers import import_dataset, read_model, write_imported
-from mapping.importers.scans import app_of
 from mapping.stages.depth import read_depth
 from samples.film import encode_video
+from tests.turning import turned_film
 from visloc.errors import DatasetError, InvalidInput, VislocError
 from visloc.geometry import Camera, Pose
 from visloc.kapture import Dataset, FileRecord, read_dataset
 from visloc.photos.reading import read_photo_file
-from visloc_extensions.capture.sources import find_sources, read_capture
-from visloc_extensions.capture.tests.test_video import turned
+from visloc_extensions.scans import app_of
 
 _UPRIGHT = (0, 1, -1, 0)  # the display matrix of a phone held upright
 ARKIT = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -109,7 +108,8 @@ def write_stray_scanner(folder: Path, frames: Sequence[Seen], *, columns: int = 
     put(folder / "camera_matrix.csv", f"{fx}, 0.0, {cx}\n0.0, {fy}, {cy}\n0.0, 0.0, 1.0")
     put(folder / "imu.csv", "timestamp, a_x, a_y, a_z\n")
     encode_video(folder / "rgb.mp4", (f.rgb for f in frames), options={"crf": "8"})
-    turned(folder / "rgb.mp4", _UPRIGHT)  # as older versions say; poses are of the stored pixels
+    # As older versions say; poses are of the stored pixels.
+    turned_film(folder / "rgb.mp4", _UPRIGHT)
 
 
 def write_polycam(folder: Path, frames: Sequence[Seen], *, corrected: bool = True) -> None:
@@ -514,14 +514,15 @@ def test_other_folders_are_no_scans(tmp_path: Path, files: dict[str, bytes | str
 def test_a_capture_takes_scans_with_their_poses_and_depth(
     seen: list[Seen], tmp_path: Path, name: str
 ) -> None:
+    capture = pytest.importorskip("visloc_extensions.capture.sources")
     app, write, _ = WRITERS[name]
     scan = tmp_path / "of a phone" / name
     write(scan, seen)
-    sources = find_sources([scan])
+    sources = capture.find_sources([scan])
     assert list(sources.exports.values()) == [(app, scan)]
     assert (sources.videos, sources.folders) == ({}, {})
     for _ in range(2):  # killed, and called again
-        model = read_capture(sources, {}, tmp_path / "work", lambda *_: None)
+        model = capture.read_capture(sources, {}, tmp_path / "work", lambda *_: None)
     assert model.metric
     assert all(image.cam_from_world is not None for image in model.images)
     assert all((image.depth is None) == (app == "record3d") for image in model.images)
