@@ -18,7 +18,12 @@ from visloc.errors import InvalidInput, VislocError, catalogue, refuse
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = (
-    *("visloc", "visloc_api", "mapping", "service", "clients", "training", "benchmarks"),
+    "visloc",
+    "visloc_api",
+    "mapping",
+    "service",
+    "clients",
+    "benchmarks",
     "visloc_extensions",
 )
 KINDS = {
@@ -33,7 +38,7 @@ TREES = {
     for path in sorted((ROOT / package).rglob("*.py"))
     if path.parent.name != "tests"
 }
-CORE = ("api", "clients", "commands", "training")  # sections; others name an extension
+CORE = ("api", "clients", "commands")  # sections of the catalogue; others name an extension
 
 # Reading
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import struct
 from dataclasses import replace
 from pathlib import Path
 
@@ -115,3 +116,20 @@ def store_dataset_turned(source: Path, target: Path) -> dict[str, int]:
 
 def _of_sensor(record: FileRecord, orientation: int) -> FileRecord:
     return replace(record, sensor_id=f"{record.sensor_id}_{orientation}")
+
+
+def turned_film(path: Path, matrix: tuple[int, int, int, int]) -> Path:
+    """Write a display matrix into an MP4's track header.
+
+    Rows of tkhd's are (a, b, u), (c, d, v), (x, y, w): p' = (a x + c y, b x + d y), y down.
+    """
+
+    def packed(a: int, b: int, c: int, d: int) -> bytes:
+        one = 1 << 16
+        return struct.pack(">9i", a * one, b * one, 0, c * one, d * one, 0, 0, 0, 1 << 30)
+
+    data = path.read_bytes()
+    at = data.index(b"tkhd")
+    place = data.index(packed(1, 0, 0, 1), at)
+    path.write_bytes(data[:place] + packed(*matrix) + data[place + 36 :])
+    return path

@@ -16,6 +16,8 @@ MAPPING_COMMANDS = "visloc.mapping_commands"
 LOCALIZE_COMMANDS = "visloc.localize_commands"
 # (path, folder of photos or None) -> mapping.importers.ImportedModel
 IMPORTERS = "visloc.importers"
+# (path) -> name of the importer that reads this file or folder, or None
+RECOGNIZERS = "visloc.recognizers"
 # (workers, address) -> context manager of a mapping.cluster.executors.Executor
 EXECUTORS = "visloc.executors"
 # (URL, folder of copies, bytes of copies) -> visloc.archive.MapStore; the name is "url".

@@ -10,9 +10,9 @@ from typing import Any
 
 from benchmarks.speed.dataset import Bench, read_errors
 from benchmarks.speed.steps import say
-from mapping.maps.export_features import export_features
 from visloc.errors import Conflict
 from visloc.options import Inference
+from visloc_extensions.research.export_features import export_features
 
 # As builds of ours have it.
 _MAX_KEYPOINTS = 5000

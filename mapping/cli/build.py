@@ -24,7 +24,7 @@ from mapping.cli.progress import StageProgress
 from mapping.cluster.stage_timings import Costs
 from mapping.cluster.storage import is_map_folder, is_remote, open_store, scratch_folder
 from mapping.importers import MASKS, ImportSummary, import_dataset, imported, importer_names
-from mapping.importers.scans import refuse_scan
+from mapping.importers.recognized import refuse_recognized
 from mapping.methods.rgbd import DepthSettings
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.options import (
@@ -104,7 +104,7 @@ def build(settings: BuildSettings, covisible_in: CovisibleInOption = None) -> No
         sfm = replace(settings.sfm, covisible_in=open_map(folder))
         settings = replace(settings, sfm=sfm)
     if not is_remote(settings.dataset):
-        refuse_scan(settings.dataset)
+        refuse_recognized(settings.dataset)
     _build(settings)
 
 

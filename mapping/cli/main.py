@@ -13,9 +13,6 @@ from mapping.cli.acceptance import use
 from mapping.cli.build import build, import_
 from mapping.cli.datasets import (
     calibrate_rig_command,
-    dataset,
-    export_features_command,
-    import_features_command,
     pairs,
     sample,
 )
@@ -41,9 +38,6 @@ COMMANDS: Mapping[str, Callable[..., None]] = {
     "use": use,
     "set": set_maps,
     "split": split,
-    "export-features": export_features_command,
-    "dataset": dataset,
-    "import-features": import_features_command,
     "sample": sample,
 }
 

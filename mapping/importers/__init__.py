@@ -1,6 +1,7 @@
 """Foreign reconstructions and photos as kapture datasets, by format.
 
-A further format is one file with ``read(path, photos)`` and one line in the registry below.
+A further format is one file with ``read(path, photos)`` and one line in the registry below,
+or, of an extension, in ``pyproject.toml``.
 """
 
 from __future__ import annotations
@@ -38,19 +39,10 @@ __all__ = [
 
 # name -> module and function (path, folder of photos or None) -> ImportedModel
 IMPORTERS: Mapping[str, tuple[str, str]] = {
-    "3dscannerapp": ("mapping.importers.scans.apps", "read_3d_scanner_app"),
-    "bundler": ("mapping.importers.bundler", "read"),
     "colmap": ("mapping.importers.colmap", "read"),
     "images": ("mapping.importers.images", "read"),
-    "nerfcapture": ("mapping.importers.scans.apps", "read_nerfcapture"),
     "nerfstudio": ("mapping.importers.nerfstudio", "read"),
-    "nvm": ("mapping.importers.nvm", "read"),
-    "openmvg": ("mapping.importers.openmvg", "read"),
-    "opensfm": ("mapping.importers.opensfm", "read"),
-    "polycam": ("mapping.importers.scans.apps", "read_polycam"),
-    "record3d": ("mapping.importers.scans.apps", "read_record3d"),
     "rosbag": ("mapping.importers.rosbag", "read"),
-    "strayscanner": ("mapping.importers.scans.apps", "read_stray_scanner"),
 }
 
 

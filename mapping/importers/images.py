@@ -19,7 +19,7 @@ from mapping.films.video import is_live_photo, stems_of_photos
 from mapping.importers.left_out import notes_on
 from mapping.importers.model import ImportedImage, ImportedModel
 from mapping.importers.reading.photo_names import natural_order
-from mapping.importers.scans import refuse_scan
+from mapping.importers.recognized import refuse_recognized
 from mapping.methods.sparse.intrinsics import FROM_EXIF
 from visloc.errors import InvalidInput, NotFound, TooLarge, VislocError, refuse
 from visloc.geometry import Camera
@@ -223,7 +223,7 @@ def _files_in(folder: Path) -> _Files:
         found.leave_out(f"{name}/", f"folders that cannot be read: {error.strerror}")
 
     for where, folders, files in os.walk(folder, onerror=unreadable):
-        refuse_scan(Path(where))  # its depth and confidence would become photos
+        refuse_recognized(Path(where))  # its depth and confidence would become photos
         entered = []
         for name in sorted(folders):
             path = Path(where) / name

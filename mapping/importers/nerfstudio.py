@@ -19,7 +19,7 @@ from mapping.importers.dataset import depth_sensor_id
 from mapping.importers.model import ImportedImage, ImportedModel
 from mapping.importers.reading.json_fields import JsonValue, notes_on_unread, read_json
 from mapping.importers.reading.photo_names import photo_names, photo_size
-from mapping.importers.reading.tracks import rotation_from_matrix
+from mapping.importers.reading.poses import rotation_from_matrix
 from mapping.stages.depth import DEFAULT_DEPTH_SCALE, is_png_of_16_bits
 from visloc.errors import DatasetError, InvalidInput, VislocError, refuse
 from visloc.geometry import MAX_IMAGE_SIDE, Camera, Pose

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from mapping.importers.dataset import depth_sensor_id
 from mapping.importers.model import ImportedImage, ImportedModel
 from mapping.importers.reading.photo_names import photo_size
-from mapping.importers.reading.tracks import has_moved
+from mapping.importers.reading.poses import has_moved
 from mapping.stages.depth import DEFAULT_DEPTH_SCALE
 from visloc.errors import DatasetError, refuse
 from visloc.geometry import Camera, Pose

@@ -72,16 +72,6 @@ def test_a_map_of_an_installed_plugin_is_built_and_localized_in(
     assert max(abs(float(metres)) for metres in offset.split()) < 0.05
     assert names == "example-thumbnail"
 
-    exported = tmp_path / "exported"
-    export = f"export-features {sample}/query --output {exported} --map room --maps-dir {maps_dir}"
-    done = python(
-        installed, "-m", "mapping.cli.main", *export.split(), "--local-features", "example-orb"
-    )
-    assert done.returncode == 0, done.stderr
-    kinds = exported / "reconstruction"
-    assert list((kinds / "descriptors" / "example-orb").rglob("*.desc"))
-    assert list((kinds / "global_features" / "example-thumbnail").rglob("*.gfeat"))
-
 
 def test_names_of_installed_plugins_are_offered(installed: Path) -> None:
     said = python(installed, "-m", "mapping.cli.main", "build", "--help").stdout

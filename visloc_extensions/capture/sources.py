@@ -13,7 +13,7 @@ from mapping.films.video import SUFFIXES, is_live_photo, is_video, stems_of_phot
 from mapping.importers import ImportedImage, ImportedModel, read_model
 from mapping.importers.left_out import LeftOut, notes_on
 from mapping.importers.reading.photo_names import natural_order, photo_size
-from mapping.importers.scans import app_of
+from mapping.importers.recognized import importer_of
 from mapping.methods.sparse.intrinsics import FROM_EXIF
 from mapping.progress import Progress
 from mapping.stages.work_folder import WorkFolder
@@ -70,7 +70,7 @@ def find_sources(paths: Sequence[Path]) -> Sources:
     for path in paths:
         if not path.exists():
             raise refuse("capture.source", field=str(path))
-        app = app_of(path)
+        app = importer_of(path)
         is_export = path.is_dir() and (path / _EXPORT).is_file()
         # Unlike Path.resolve, this does not raise for a link that leads to itself.
         place = os.path.realpath(path / _EXPORT if is_export else path)

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
@@ -12,27 +11,14 @@ import pytest
 from mapping.films import video
 from mapping.films.video import frames_of, is_video, video_facts
 from tests.mapping.films.conftest import Picture, panned
+from tests.turning import turned_film
 from visloc.errors import InvalidInput, TooLarge
 
 MakeVideo = Callable[..., Path]
-# tkhd's matrix, rows (a, b, u), (c, d, v), (x, y, w): p' = (a x + c y, b x + d y), y down.
+# Display matrices of films, as ``turned_film`` has them.
 _PLAIN = (1, 0, 0, 1)
 # What shows right (1, 0) down (0, 1) turns the picture clockwise: a phone held upright.
 _CLOCKWISE, _HALF, _ANTICLOCKWISE = (0, 1, -1, 0), (-1, 0, 0, -1), (0, -1, 1, 0)
-
-
-def turned(path: Path, matrix: tuple[int, int, int, int]) -> Path:
-    """Write a display matrix into an MP4's track header."""
-
-    def packed(a: int, b: int, c: int, d: int) -> bytes:
-        one = 1 << 16
-        return struct.pack(">9i", a * one, b * one, 0, c * one, d * one, 0, 0, 0, 1 << 30)
-
-    data = path.read_bytes()
-    at = data.index(b"tkhd")
-    place = data.index(packed(*_PLAIN), at)
-    path.write_bytes(data[:place] + packed(*matrix) + data[place + 36 :])
-    return path
 
 
 def corner_marked(width: int = 320, height: int = 240) -> Picture:
@@ -64,7 +50,7 @@ def test_frames_are_turned_as_the_container_says(
     size: tuple[int, int],
     corner: tuple[bool, bool],
 ) -> None:
-    path = turned(make_video([corner_marked()] * 3), matrix)
+    path = turned_film(make_video([corner_marked()] * 3), matrix)
     rgb = next(frames_of(path)).upright_rgb()
     assert rgb.shape == (*size, 3)
     assert red_corner(rgb) == corner
@@ -179,7 +165,7 @@ def test_pixels_become_square(
     red = frame.rgb()[..., 0].astype(int) - frame.rgb()[..., 2] > 100
     assert red.mean() == pytest.approx(0.25, abs=0.01)  # still a quarter, at the top left
     assert red_corner(frame.rgb()) == (False, False)
-    turned(path, _CLOCKWISE)  # first squared, then turned
+    turned_film(path, _CLOCKWISE)  # first squared, then turned
     assert next(frames_of(path)).upright_rgb().shape == (*size, 3)
 
 

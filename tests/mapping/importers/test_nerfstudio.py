@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mapping.importers import MASKS, import_dataset, read_model
+from mapping.importers import MASKS, import_dataset
 from mapping.importers.nerfstudio import read
 from mapping.stages.depth import DepthMatcher, photo_depth, read_depth
 from mapping.stages.photos import collect_photos, masked
@@ -401,20 +401,14 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("reader", "top", "named"),
+    ("top", "named"),
     [
-        ("nerfstudio", {"root_path": ".", "views": []}, "mapping import openmvg"),
-        ("nerfstudio", [{"shots": {}, "cameras": {}}], "mapping import opensfm"),
-        ("openmvg", {"frames": []}, "mapping import nerfstudio"),
-        ("openmvg", {"version": [], "matchesFolders": [], "views": []}, "aliceVision_exportColmap"),
-        ("opensfm", {"version": [], "featuresFolders": [], "views": []}, "Meshroom"),
-        ("opensfm", {"frames": []}, "mapping import nerfstudio"),
+        ({"root_path": ".", "views": []}, "mapping import openmvg"),
+        ([{"shots": {}, "cameras": {}}], "mapping import opensfm"),
     ],
 )
-def test_a_file_of_another_program_is_recognized(
-    tmp_path: Path, reader: str, top: Any, named: str
-) -> None:
+def test_a_file_of_another_program_is_recognized(tmp_path: Path, top: Any, named: str) -> None:
     (tmp_path / "cameras.sfm").write_text(json.dumps(top))
     with pytest.raises(DatasetError, match=named) as caught:
-        read_model(reader, tmp_path / "cameras.sfm")
+        read(tmp_path / "cameras.sfm")
     assert caught.value.code == "import.json"

@@ -12,14 +12,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mapping.maps.export_features import export_features
 from mapping.pipeline.build import build_map
 from mapping.pipeline.settings import BuildSettings
 from mapping.stages.photos import read_in_frame
 from tests.turning import (
     png,
     store_dataset_turned,
-    store_photo_turned,
     turned_camera,
     turned_pixels,
     turned_points,
@@ -30,10 +28,10 @@ from visloc.errors import DatasetError
 from visloc.evaluation import pose_error
 from visloc.features import make_local_features
 from visloc.features.photo import extract_features
-from visloc.geometry import Camera, PixelOrigin, Pose
-from visloc.kapture import open_local_features, read_dataset, read_local
+from visloc.geometry import Camera, Pose
+from visloc.kapture import read_dataset
 from visloc.localization.localizer import Localizer
-from visloc.options import Inference, LocalizeOptions, ReadAs
+from visloc.options import LocalizeOptions, ReadAs
 from visloc.photos.reading import read_photo, read_photo_file, turn_of
 from visloc.types import Localized
 
@@ -216,28 +214,3 @@ def test_the_size_of_the_camera_tells_whose_frame_a_photo_is_read_in(
     assert photo.exif_orientation == (6 if read == "stored" else 1)
     expected = upright if read == "upright" else np.rot90(upright)
     np.testing.assert_array_equal(photo.rgb, expected)
-
-
-def test_exported_features_of_turned_photos_are_in_stored_pixels(
-    sample: Path, tmp_path: Path
-) -> None:
-    dataset = Path(shutil.copytree(sample / "mapping", tmp_path / "dataset"))
-    photo = dataset / "sensors" / "records_data" / "mapping" / "left" / "0001.jpg"
-    store_photo_turned(photo, 3)  # of the same size
-    keypoints = []
-    for name, source in (("turned", dataset), ("straight", sample / "mapping")):
-        output = tmp_path / name
-        export_features(
-            source,
-            output,
-            local_features="sift",
-            weights_dir=None,
-            inference=Inference.AUTO,
-            max_keypoints=500,
-            global_from=None,
-            progress=quiet,
-        )
-        sets = open_local_features(output, "sift", None)
-        rows = read_local(*sets, "mapping/left/0001.jpg", SIZE, PixelOrigin.CORNER)
-        keypoints.append(rows[0])
-    np.testing.assert_allclose(keypoints[0], turned_points(keypoints[1], SIZE, 3), atol=1e-3)

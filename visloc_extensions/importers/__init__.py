@@ -1,0 +1,1 @@
+"""Importers of reconstructions of Bundler, VisualSFM (NVM), OpenMVG and OpenSfM."""
