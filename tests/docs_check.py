@@ -41,6 +41,7 @@ PAGES = (
     ROOT / "README.md",
     ROOT / "CONTRIBUTING.md",
     *sorted((ROOT / "docs").rglob("*.md")),
+    *sorted(ROOT.glob("visloc_extensions/*/README.md")),
     ROOT / "examples" / "plugin" / "README.md",
 )
 DATA = ROOT.parent / "shared" / "data"

@@ -14,7 +14,8 @@ from pathlib import Path
 
 from visloc.errors import Entry, catalogue
 
-DOCS = Path(__file__).resolve().parents[1] / "docs"
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
 _TABLE = re.compile(
     r"(<!-- error codes: (?P<wanted>.+?) -->\n).*?(<!-- end of error codes -->)", re.DOTALL
 )
@@ -22,7 +23,8 @@ _TABLE = re.compile(
 
 def pages() -> list[Path]:
     """The pages that have such a table."""
-    return [page for page in sorted(DOCS.rglob("*.md")) if _TABLE.search(page.read_text())]
+    pages = (*DOCS.rglob("*.md"), *ROOT.glob("visloc_extensions/*/README.md"))
+    return [page for page in sorted(pages) if _TABLE.search(page.read_text())]
 
 
 def codes_wanted(text: str) -> list[str]:

@@ -47,7 +47,11 @@ from visloc_api.words.status import Problem
 
 ROOT = Path(__file__).resolve().parents[1]
 FIRST_STEPS, API = ROOT / "docs" / "first-steps.md", ROOT / "docs" / "api.md"
-PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [
+    page
+    for pattern in ("*.md", "docs/**/*.md", "visloc_extensions/*/README.md")
+    for page in sorted(ROOT.glob(pattern))
+]
 COMMANDS = Path(sys.executable).parent
 
 # Reading
