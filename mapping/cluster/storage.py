@@ -91,10 +91,17 @@ def storage_failed(error: Exception, place: Path) -> VislocError:
 
 
 def open_store(maps_dir: Path, cache_dir: Path) -> MapStore:
-    """Return the store of a folder, or of a URL with local copies in ``cache_dir``."""
+    """Return the store of a folder, or of a URL with local copies in ``cache_dir``.
+
+    Raises:
+        InvalidInput: ``build.url`` without the extension that opens URLs.
+    """
     if not is_remote(maps_dir):
         return MapStore(maps_dir)
-    return open_remote_store(str(maps_dir), cache_dir, sys.maxsize)
+    try:
+        return open_remote_store(str(maps_dir), cache_dir, sys.maxsize)
+    except ImportError as error:
+        raise _bad_url("--maps-dir", str(error)) from error
 
 
 def is_map_folder(ref: str) -> bool:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
+from time import sleep
 from typing import Any
 
 import numpy as np
@@ -15,6 +18,7 @@ from mapping.maps.sets import publish_set
 from mapping.pipeline.build import build_map
 from mapping.pipeline.settings import BuildSettings
 from mapping.sample import write_sample
+from service.telemetry.metrics import ServiceState
 from visloc.archive import MapStore
 from visloc.geometry import Similarity
 from visloc.kapture import read_dataset
@@ -104,3 +108,20 @@ def photos_of(study: Path) -> list[Any]:
         )
         for record in dataset.images
     ]
+
+
+def state_of(doors: Any) -> ServiceState:
+    async def state() -> ServiceState:
+        return doors.server.state()
+
+    loop = doors.server.engine._following.get_loop()
+    return asyncio.run_coroutine_threadsafe(state(), loop).result(60)
+
+
+def busy(state: ServiceState) -> int:
+    return state.photos_waiting + state.photos_running
+
+
+def wait_until(holds: Callable[[], bool]) -> None:
+    while not holds():
+        sleep(0.005)

@@ -124,6 +124,12 @@ def test_what_is_no_folder_is_refused_by_name(name: str, tmp_path: Path) -> None
             Server(ServiceSettings(**given, http_port=0, grpc_port=0))
 
 
+def test_maps_at_a_url_are_refused_without_the_extension(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("visloc.archive.store.extensions", lambda _group: {})
+    with pytest.raises(SettingsError, match=r"^maps_dir: .* need the extension object_storage$"):
+        Server(ServiceSettings(maps_dir="s3://bucket/maps", http_port=0, grpc_port=0))
+
+
 def test_answers_on_a_connection_that_is_kept_do_not_wait_for_acknowledgements() -> None:
     with (
         _listen("127.0.0.1", 0) as listener,

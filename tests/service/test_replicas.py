@@ -15,7 +15,6 @@ from pathlib import Path
 import grpc
 import httpx
 import pytest
-from moto.server import ThreadedMotoServer
 
 from benchmarks.reliability.replicas import Balanced, balanced, wait_until
 from benchmarks.reliability.service_process import READY_WITHIN_S, ServiceProcess
@@ -178,28 +177,6 @@ def test_a_map_that_came_through_one_is_served_by_all(
     both: Balanced, hall: Path, query: Query
 ) -> None:
     served_by_all(both, hall, query)
-
-
-def test_a_map_in_an_object_store_is_served_by_all(
-    hall: Path, query: Query, tmp_path: Path
-) -> None:
-    storage = ThreadedMotoServer("127.0.0.1", 0, verbose=False)
-    storage.start()
-    host, port = storage.get_host_and_port()
-    endpoint = f"http://{host}:{port}"
-    environment = {
-        "AWS_ENDPOINT_URL": endpoint,
-        "AWS_ACCESS_KEY_ID": "AKIDEXAMPLE",
-        "AWS_SECRET_ACCESS_KEY": "of-no-account",
-        "AWS_DEFAULT_REGION": "us-east-1",
-    }
-    try:
-        httpx.put(f"{endpoint}/replicas").raise_for_status()
-        urls = ["s3://replicas/maps"] * 2
-        with balanced(urls, tmp_path, environment) as pair:
-            served_by_all(pair, hall, query)
-    finally:
-        storage.stop()
 
 
 def served_by_all(pair: Balanced, hall: Path, query: Query) -> None:

@@ -1,18 +1,16 @@
-"""Builds whose dataset, work and maps are in an S3 server, spoken to over a real socket."""
+"""Builds whose dataset and work are in an S3 server, spoken to over a real socket."""
 
 from __future__ import annotations
 
 import errno
 import os
-import shutil
 from pathlib import Path
 
 import fsspec
 import numpy as np
 import pytest
 
-from mapping.cli.acceptance import use
-from mapping.cluster.storage import is_remote, open_store, opened_dataset, place_of, storage_failed
+from mapping.cluster.storage import is_remote, opened_dataset, place_of, storage_failed
 from mapping.pipeline.build import build_map
 from mapping.pipeline.settings import BuildSettings
 from mapping.stages.work_folder import WorkFolder, key_of
@@ -29,7 +27,7 @@ def settings_for(bucket: str, tmp_path: Path, **changes: object) -> BuildSetting
     values: dict[str, object] = {
         "dataset": place_of(f"{bucket}/walk", "dataset"),
         "map_id": "walk",
-        "maps_dir": place_of(f"{bucket}/{tmp_path.name}/maps", "--maps-dir"),
+        "maps_dir": tmp_path / "maps",
         "local_features": "sift",
         "global_features": ("localvlad",),
         "max_keypoints": 500,
@@ -43,45 +41,11 @@ def objects_of(bucket: str) -> set[str]:
     return {path.partition("/")[2] for path in storage.find(bucket)}
 
 
-def test_a_build_from_and_to_urls_makes_the_map_of_a_local_build(
-    bucket: str, tmp_path: Path, sfm_walk: Map
-) -> None:
-    settings = settings_for(bucket, tmp_path, method="sfm")
-    seen: set[str] = set()
-
-    def watch(stage: str, done: int, total: int) -> None:
-        if stage == "archive" and done < total:
-            seen.update(objects_of(bucket))
-
-    built = open_map(build_map(settings, watch))
-    assert built.manifest.content_hash == sfm_walk.manifest.content_hash
-    assert sum(f"{tmp_path.name}/maps/.work/walk/local_features/" in name for name in seen) == 16
-    left = {name for name in objects_of(bucket) if name.startswith(tmp_path.name)}
-    assert not any(".work" in name for name in left)
-    published = open_store(settings.maps_dir, tmp_path / "other cache")
-    again = open_map(published.folder("walk"))
-    assert again.manifest.content_hash == sfm_walk.manifest.content_hash
-
-
-def test_a_version_at_a_url_is_put_into_use(bucket: str, tmp_path: Path, sfm_walk: Map) -> None:
-    maps = place_of(f"{bucket}/{tmp_path.name}/maps", "--maps-dir")
-    store, version = open_store(maps, tmp_path / "cache"), sfm_walk.manifest.version
-    with store.incoming() as incoming:
-        shutil.copytree(sfm_walk.path, incoming / "map")
-        store.publish(incoming / "map", "walk", version, make_current=False)
-
-    use(f"walk@{version}", maps, tmp_path / "another cache")
-
-    assert open_store(maps, tmp_path / "other cache").current_version("walk") == version
-
-
 def test_a_build_that_was_interrupted_finds_its_work_at_the_url(
     bucket: str, tmp_path: Path, rgbd_walk: Map
 ) -> None:
     work = place_of(f"{bucket}/{tmp_path.name}/work", "--work-dir")
-    settings = settings_for(
-        bucket, tmp_path, method="rgbd", work_dir=work, maps_dir=tmp_path / "maps"
-    )
+    settings = settings_for(bucket, tmp_path, method="rgbd", work_dir=work)
 
     def stop(stage: str, done: int, _total: int) -> None:
         if stage == "depth" and done == 3:
@@ -237,6 +201,16 @@ def test_a_url_that_cannot_be_used_is_refused(url: str) -> None:
         place_of(url, "--work-dir")
     assert (caught.value.code, caught.value.field) == ("build.url", "--work-dir")
     assert "secret" not in str(caught.value)
+
+
+def test_maps_at_a_url_are_refused_without_the_extension(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("visloc.archive.store.extensions", lambda _group: {})
+    settings = BuildSettings(tmp_path, "walk", place_of("s3://bucket/maps", "--maps-dir"))
+    with pytest.raises(InvalidInput, match="need the extension object_storage") as caught:
+        build_map(settings, quiet)
+    assert (caught.value.code, caught.value.field) == ("build.url", "--maps-dir")
 
 
 def test_a_url_without_a_dataset_is_refused(bucket: str, tmp_path: Path) -> None:

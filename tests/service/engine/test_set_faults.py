@@ -13,7 +13,6 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
-from time import sleep
 from typing import Any
 
 import cv2
@@ -27,22 +26,23 @@ from service.engine.catalog import Catalog
 from service.engine.listing import Listing
 from service.engine.set_photos import Slots
 from service.engine.set_sequences import SetSequence
-from service.telemetry.metrics import ServiceState
 from service.values import Near as Circle
 from tests.service.map_sets import (
     SITE_FROM_ROOM,
     SITE_FROM_STUDY,
     START,
+    busy,
     copy_map,
     instants,
     quiet,
+    state_of,
+    wait_until,
 )
 from visloc.archive import MapOutline, MapStore, SetOutline
 from visloc.errors import Conflict, NotFound, Unavailable, VislocError
 from visloc.geometry import Pose
 from visloc.kapture import read_dataset
 from visloc.priors import PositionPrior, Priors
-from visloc_extensions.object_storage.remote_store import RemoteMapStore
 
 Serve = Callable[..., AbstractContextManager[Any]]
 
@@ -68,23 +68,6 @@ def told(client: Client, sent: list[Instant], asked: Any) -> list[tuple[str, str
     except VislocError as error:
         found.append(("error", error.code))
     return found
-
-
-def state_of(doors: Any) -> ServiceState:
-    async def state() -> ServiceState:
-        return doors.server.state()
-
-    loop = doors.server.engine._following.get_loop()
-    return asyncio.run_coroutine_threadsafe(state(), loop).result(60)
-
-
-def busy(state: ServiceState) -> int:
-    return state.photos_waiting + state.photos_running
-
-
-def wait_until(holds: Callable[[], bool]) -> None:
-    while not holds():
-        sleep(0.005)
 
 
 def test_near_searches_the_tiles_that_reach_into_the_circle(
@@ -322,43 +305,6 @@ def test_photos_that_wait_for_a_set_are_counted(site: Path, serve: Serve, query:
             assert most == sent
             assert all(answer.result() for answer in answers)
         assert state_of(doors).photos_waiting == 0
-
-
-def test_a_tile_that_is_being_fetched_holds_up_no_other_set(
-    site: Path,
-    serve: Serve,
-    query: Any,
-    in_study: list[Any],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    fetch, asked, arrives = RemoteMapStore.folder, threading.Event(), threading.Event()
-
-    def slow(self: RemoteMapStore, ref: str) -> Path:
-        if ref.startswith("study@"):
-            asked.set()
-            assert arrives.wait(60)
-        return fetch(self, ref)
-
-    monkeypatch.setattr(RemoteMapStore, "folder", slow)
-    settings = {"cache_dir": tmp_path / "cache", "max_loaded_bytes": 1}
-    image, camera, _ = in_study[0]
-    with serve(f"file://{site}", workers=1, **settings) as doors:
-
-        def ask() -> Any:
-            with Client(doors.url) as client:
-                return client.localize(image, "site", camera).tile
-
-        with ThreadPoolExecutor(4) as pool, Client(doors.url) as client:
-            # More than there is room for in memory.
-            answers = [pool.submit(ask) for _ in range(4)]
-            assert asked.wait(60)
-            wait_until(lambda: doors.server.engine.photos == 4 and not busy(state_of(doors)))
-            here = Priors(maps=("room",))
-            assert client.localize(query.image, "site", query.camera, priors=here).pose is not None
-            assert not any(answer.done() for answer in answers)
-            arrives.set()
-            assert all(answer.result().startswith("study@") for answer in answers)
 
 
 def test_a_version_that_a_set_names_stays_open_when_another_takes_over(

@@ -445,26 +445,6 @@ def test_a_packed_set_is_uploaded_and_put_into_use(
         assert client.localize(query.image, "site", query.camera).pose is not None
 
 
-def test_tiles_of_a_remote_store_are_fetched_when_they_are_searched(
-    site: Path, serve: Serve, query: Any, tmp_path: Path
-) -> None:
-    cache = tmp_path / "cache"
-    room, study = (MapStore(site).current_version(name) for name in ("room", "study"))
-
-    def fetched() -> set[str]:
-        return {path.parent.name for path in cache.rglob("manifest.json")}
-
-    # Little room: the sets come first, their tiles when they are asked for.
-    settings = {"cache_dir": cache, "max_loaded_bytes": 1}
-    with serve(f"file://{site}", **settings) as doors, Client(doors.url) as client:
-        assert not fetched() & {room, study}
-        for _ in range(2):
-            found = client.localize(query.image, "site", query.camera)
-            assert found.pose is not None
-            assert found.tile == f"room@{room}"
-        assert room in fetched()
-
-
 def test_a_set_on_earth_is_searched_instead_of_its_tiles(
     built_maps: Path, serve: Serve, query: Any, tmp_path: Path
 ) -> None:

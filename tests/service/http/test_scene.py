@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import shutil
 import struct
 import threading
 from collections.abc import AsyncIterator
@@ -231,21 +230,6 @@ def test_a_damaged_map_is_told_as_such(
         problem(doors.http.get(f"/maps/room/{path}"), 500, code)
         file.write_bytes(good)  # a failure is not kept
         assert doors.http.get(f"/maps/room/{path}").status_code == 200
-
-
-def test_maps_of_a_remote_store_are_fetched_and_fetched_again_when_their_copy_went(
-    maps_dir: Path, tmp_path: Path, serve: Any
-) -> None:
-    cache = tmp_path / "cache"
-    with serve(f"file://{maps_dir}", cache_dir=cache, load=False) as doors:
-        first = doors.http.get("/maps/room/points")
-        assert first.status_code == 200
-        (folder,) = {path.parent for path in cache.rglob("landmarks.npy")}
-        shutil.rmtree(folder)
-        again = doors.http.get("/maps/room/points")
-        assert again.content == first.content
-        assert doors.http.get("/maps/room/images").status_code == 200
-    assert folder.is_dir()
 
 
 # Work

@@ -27,7 +27,6 @@ from visloc.archive.packed import pack_map, unpack_map
 from visloc.errors import Conflict, InvalidInput, MapCorrupt, NotFound
 from visloc.geometry import Similarity
 from visloc.sets.coarse import TILE_LISTS
-from visloc_extensions.object_storage.remote_store import RemoteMapStore
 
 LARGE = 2**30
 SECOND = Similarity(1.0, np.eye(3), np.array([100.0, 0.0, 3.0]))
@@ -214,90 +213,6 @@ def test_a_packed_set_is_the_same_set(store: MapStore, tmp_path: Path) -> None:
     assert verify_any(tmp_path / "again").manifest == store.outline("house").manifest
 
 
-def test_a_url_keeps_the_same_rules(incoming: Callable[..., Path], tmp_path: Path) -> None:
-    (tmp_path / "bucket").mkdir()
-
-    def remote(name: str) -> RemoteMapStore:
-        return RemoteMapStore(f"file://{tmp_path}/bucket", tmp_path / name, LARGE)
-
-    def publish(ref: str, map_id: str, version: str) -> None:
-        with server.incoming() as folder:
-            made = Path(shutil.copytree(incoming(ref, map_id, version), folder / "map"))
-            server.publish(made, map_id, version)
-
-    server = remote("cache")
-    with pytest.raises(NotFound, match="the store does not have a tile"):
-        publish("house", "house", "v2")
-    publish("hall", "hall", "v1")
-    publish("attic", "attic", "v1")
-    publish("house", "house", "v2")
-    with pytest.raises(Conflict, match="has this id"):
-        publish("hall", "house", "v3")
-    with pytest.raises(Conflict, match="tile of a current set"):
-        server.remove("hall", "v1")
-
-    # Another server, without copies: the outline needs no tile, the set no other file.
-    other = remote("cache of another")
-    outline = other.outline("house")
-    assert isinstance(outline, SetOutline)
-    assert [tile.ref for tile in outline.tiles] == ["hall@v1", "attic@v1"]
-    assert open_set(other.folder("house")).ref == "house@v2"
-    other.set_current("house", "v2")
-    assert [path.name for path in (tmp_path / "cache of another").glob("*/[!.]*")] == ["house"]
-    other.remove("house", "v2")
-    other.remove("hall", "v1")
-
-
-def bucket_of(tmp_path: Path) -> tuple[Path, Callable[[str], RemoteMapStore]]:
-    """An empty storage, and what opens it with a folder of copies of this name."""
-    bucket = tmp_path / "bucket"
-    bucket.mkdir()
-    return bucket, lambda cache: RemoteMapStore(f"file://{bucket}", tmp_path / cache, LARGE)
-
-
-def push(store: RemoteMapStore, made: Path, map_id: str, version: str) -> None:
-    with store.incoming() as folder:
-        store.publish(Path(shutil.copytree(made, folder / "map")), map_id, version)
-
-
-def test_a_damaged_copy_of_a_set_does_not_free_its_tiles(store: MapStore, tmp_path: Path) -> None:
-    bucket, remote = bucket_of(tmp_path)
-    server = remote("cache")
-    for map_id in ("hall", "attic", "house"):
-        folder = store.folder(map_id)
-        push(server, folder, map_id, folder.name)
-    (copy,) = (tmp_path / "cache").glob("*/house/*/manifest.json")
-    copy.write_bytes(copy.read_bytes()[:-30])
-
-    with pytest.raises(Conflict, match="tile of a current set"):
-        server.remove("hall", "v1")
-
-    (damaged,) = bucket.glob("house/*/manifest.json")
-    damaged.write_bytes(damaged.read_bytes()[:-30])
-    with pytest.raises(Conflict, match=r"house@.* cannot be read") as caught:
-        server.remove("hall", "v1")
-    assert caught.value.code == "map.in_set"
-    assert (bucket / "hall" / "v1" / "manifest.json").is_file()
-    server.remove("house", damaged.parent.name)
-    server.remove("hall", "v1")
-
-
-def test_a_set_is_not_taken_for_the_tile_that_a_copy_was(
-    store: MapStore, incoming: Callable[..., Path], tmp_path: Path
-) -> None:
-    _, remote = bucket_of(tmp_path)
-    server, other = remote("cache"), remote("cache of another")
-    for map_id in ("hall", "attic"):
-        push(server, store.folder(map_id), map_id, "v1")
-    other.remove("hall", "v1")
-    push(other, incoming("hall", "hall", "v1", notes=["another hall"]), "hall", "v1")
-
-    house = store.folder("house")
-    with pytest.raises(Conflict, match="the store has another tile") as caught:
-        push(remote("cache"), house, "house", house.name)  # that server, started again
-    assert caught.value.code == "set.tile"
-
-
 def test_a_set_that_cannot_be_read_frees_no_tile(store: MapStore) -> None:
     house = store.folder("house")
     (house / "manifest.json").write_text("{")
@@ -309,10 +224,8 @@ def test_a_set_that_cannot_be_read_frees_no_tile(store: MapStore) -> None:
     store.remove("hall", "v1")
 
 
-def test_what_is_a_set_its_manifest_says(store: MapStore, tmp_path: Path) -> None:
-    _, remote = bucket_of(tmp_path)
-    server = remote("cache")
-    # A map with a file of a set, and a set that lost it.
+def mix_up_files(store: MapStore) -> None:
+    """A map with a file of a set, and a set that knows it."""
     hall, house = store.folder("hall"), store.folder("house")
     (hall / "coarse").mkdir()
     shutil.copy(house / "coarse/offsets.npy", hall / "coarse/offsets.npy")
@@ -325,18 +238,23 @@ def test_what_is_a_set_its_manifest_says(store: MapStore, tmp_path: Path) -> Non
     tiles = json.loads((house / "manifest.json").read_text())["tiles"]
     tiles[0]["content_hash"] = hashed
     renamed(house, "house", house.name, tiles=tiles)
-    for map_id in ("hall", "attic", "house"):
-        push(server, store.folder(map_id), map_id, store.folder(map_id).name)
 
-    for one, folder in ((store, house), (server, tmp_path / "bucket" / "house" / house.name)):
-        for lost in (False, True):
-            if lost:
-                (folder / "coarse/offsets.npy").unlink()
-            for tile in ("hall", "attic"):
-                with pytest.raises(Conflict, match="tile of a current set"):
-                    one.remove(tile, "v1")
-        one.remove("house", house.name)
-        one.remove("attic", "v1")
+
+def assert_told_by_manifests(store: MapStore, house: Path) -> None:
+    """Which is a map and which a set, also once the set has lost its file."""
+    for lost in (False, True):
+        if lost:
+            (house / "coarse/offsets.npy").unlink()
+        for tile in ("hall", "attic"):
+            with pytest.raises(Conflict, match="tile of a current set"):
+                store.remove(tile, "v1")
+    store.remove("house", house.name)
+    store.remove("attic", "v1")
+
+
+def test_what_is_a_set_its_manifest_says(store: MapStore) -> None:
+    mix_up_files(store)
+    assert_told_by_manifests(store, store.folder("house"))
 
 
 # Damage

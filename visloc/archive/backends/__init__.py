@@ -1,1 +1,1 @@
-"""Where a store keeps its maps: a folder, or object storage with local copies."""
+"""Where a store keeps its maps: a folder."""
