@@ -201,7 +201,7 @@ RULES = (
     Rule(Tier.PARSED, r"results|rigs-and|scale\.md|performance", r"", _HOURS),
     Rule(Tier.PARSED, r"operations|decisions", r"(\w+=\S+ )*python -m benchmarks", _HOURS),
     Rule(Tier.PARSED, r"living_maps|map-sets|mapping\.md", r"python ", _HOURS),
-    Rule(Tier.PARSED, r"models/", r"", "hours of training; tests/training"),
+    Rule(Tier.PARSED, r"visloc_extensions/training", r"", "hours of training"),
 )
 PROGRAMS = (
     *("mapping", "localize", "visloc-service", "python", "make"),

@@ -1,4 +1,4 @@
-"""The command ``python -m training``."""
+"""The command ``python -m visloc_extensions.training``."""
 
 from __future__ import annotations
 
@@ -13,19 +13,25 @@ from pathlib import Path
 
 import torch
 
-from training.checkpoint import FILE_NAME, State, load_state
-from training.export import export
-from training.pairs import make_sources
-from training.parallax import pack_rooms, read_rooms
-from training.photos import pack_photos, read_pack
-from training.plots import draw
-from training.ranges import paint_pictures, record_ranges
-from training.run import Trainer, resume, train
-from training.settings import PRESETS, Settings
-from training.validation import CHANGES, Score, features_of, validate, validation_pairs
 from visloc.errors import VislocError, refuse
 from visloc.features import make_local_features
 from visloc.features.backends.calibration import PICTURES, RECORDED
+from visloc_extensions.training.checkpoint import FILE_NAME, State, load_state
+from visloc_extensions.training.export import export
+from visloc_extensions.training.pairs import make_sources
+from visloc_extensions.training.parallax import pack_rooms, read_rooms
+from visloc_extensions.training.photos import pack_photos, read_pack
+from visloc_extensions.training.plots import draw
+from visloc_extensions.training.ranges import paint_pictures, record_ranges
+from visloc_extensions.training.run import Trainer, resume, train
+from visloc_extensions.training.settings import PRESETS, Settings
+from visloc_extensions.training.validation import (
+    CHANGES,
+    Score,
+    features_of,
+    validate,
+    validation_pairs,
+)
 
 DATA = Path(".training")
 _CPU = torch.device("cpu")
@@ -42,7 +48,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m training", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m visloc_extensions.training", description=__doc__
+    )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     pack = commands.add_parser("pack", help="pack photos into one file")

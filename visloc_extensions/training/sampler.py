@@ -16,9 +16,9 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from training.interpolation import neighbours
-from training.losses import quantized_average_precision
-from training.network import Maps
+from visloc_extensions.training.interpolation import neighbours
+from visloc_extensions.training.losses import quantized_average_precision
+from visloc_extensions.training.network import Maps
 
 RIGHT_WITHIN_PX = 3
 WRONG_FROM_PX = 5

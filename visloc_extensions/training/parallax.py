@@ -22,10 +22,10 @@ from torch import Tensor
 from samples.render import render_depth, render_photo
 from samples.scene import make_room
 from samples.trajectories import mapping_trajectory
-from training.files import write_tensors
-from training.homographies import Matrices, looks_at, moved, rotations_about
 from visloc.errors import NotFound, refuse
 from visloc.geometry import Camera, Pose
+from visloc_extensions.training.files import write_tensors
+from visloc_extensions.training.homographies import Matrices, looks_at, moved, rotations_about
 
 WIDTH_PX, HEIGHT_PX = 480, 360
 _CAMERA = Camera("PINHOLE", WIDTH_PX, HEIGHT_PX, (360.0, 360.0, WIDTH_PX / 2, HEIGHT_PX / 2))

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from safetensors.numpy import load, save
 
-from training.files import read_about, write_tensors
-from training.parallax import read_rooms
-from training.photos import read_pack
 from visloc.errors import InvalidInput
+from visloc_extensions.training.files import read_about, write_tensors
+from visloc_extensions.training.parallax import read_rooms
+from visloc_extensions.training.photos import read_pack
 
 
 def test_what_is_written_is_read_whatever_its_order_in_memory(tmp_path: Path) -> None:

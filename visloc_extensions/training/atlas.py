@@ -10,8 +10,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from training.homographies import Matrices, applied, pixel_centres, scaled_and_moved, scales
-from training.photos import Photo
+from visloc_extensions.training.homographies import (
+    Matrices,
+    applied,
+    pixel_centres,
+    scaled_and_moved,
+    scales,
+)
+from visloc_extensions.training.photos import Photo
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,9 +11,9 @@ from typing import Any
 
 import torch
 
-from training.files import write_whole
-from training.settings import Settings
 from visloc.errors import NotFound, refuse
+from visloc_extensions.training.files import write_whole
+from visloc_extensions.training.settings import Settings
 
 FILE_NAME = "checkpoint.pt"
 _VERSION = 2
@@ -30,7 +30,7 @@ class State:
         step: how many are done.
         seconds: how long that took, on all machines together.
         sources: words for the model card: sha256 of the photos, their licences, and so on.
-        network: state dict of ``training.network.TrainableR2D2``, or of XFeat's ``XFeatModule``.
+        network: state dict of ``TrainableR2D2``, or of XFeat's ``XFeatModule``.
         optimizer: state dict of Adam.
     """
 

@@ -15,12 +15,19 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from training.augmentation import augment
-from training.conditions import Conditions
-from training.pairs import Pairs, Sources, as_numbers, draw, from_numbers, photograph
-from training.settings import Settings
 from visloc.features.networks.xfeat.model import read_published
 from visloc.features.networks.xfeat.torch import XFeatModule
+from visloc_extensions.training.augmentation import augment
+from visloc_extensions.training.conditions import Conditions
+from visloc_extensions.training.pairs import (
+    Pairs,
+    Sources,
+    as_numbers,
+    draw,
+    from_numbers,
+    photograph,
+)
+from visloc_extensions.training.settings import Settings
 
 _TEMPERATURE = 0.1  # of the softmax over cosines
 _SAME_PLACE_PX = 8.0  # closer places are no wrong answers: they share a cell

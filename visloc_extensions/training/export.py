@@ -11,13 +11,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from training.checkpoint import State
-from training.files import write_tensors
-from training.network import ARCHITECTURES, TrainableR2D2
 from visloc.errors import refuse
 from visloc.features.networks.r2d2 import model as r2d2
 from visloc.features.networks.xfeat import model as xfeat
 from visloc.features.networks.xfeat.torch import XFeatModule
+from visloc_extensions.training.checkpoint import State
+from visloc_extensions.training.files import write_tensors
+from visloc_extensions.training.network import ARCHITECTURES, TrainableR2D2
 
 Arrays = Mapping[str, NDArray[Any]]
 

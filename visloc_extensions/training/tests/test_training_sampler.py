@@ -6,10 +6,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from training.interpolation import neighbours, weighted_squares
-from training.losses import quantized_average_precision
-from training.network import Maps
-from training.sampler import offsets, random_pixels, sample
+from visloc_extensions.training.interpolation import neighbours, weighted_squares
+from visloc_extensions.training.losses import quantized_average_precision
+from visloc_extensions.training.network import Maps
+from visloc_extensions.training.sampler import offsets, random_pixels, sample
 
 STRIDES = pytest.mark.parametrize("stride", [1, 2])
 

@@ -14,14 +14,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from training.atlas import Atlas, levels_to_look_at, look, make_atlas
-from training.augmentation import augment
-from training.conditions import Conditions, draw_conditions
-from training.homographies import applied, pixel_centres, random_looks, strength_at
-from training.parallax import Place, Rooms, make_rooms, other_view, random_views
-from training.photos import Photo, photo_levels
-from training.sampler import random_pixels
-from training.settings import Settings
+from visloc_extensions.training.atlas import Atlas, levels_to_look_at, look, make_atlas
+from visloc_extensions.training.augmentation import augment
+from visloc_extensions.training.conditions import Conditions, draw_conditions
+from visloc_extensions.training.homographies import (
+    applied,
+    pixel_centres,
+    random_looks,
+    strength_at,
+)
+from visloc_extensions.training.parallax import Place, Rooms, make_rooms, other_view, random_views
+from visloc_extensions.training.photos import Photo, photo_levels
+from visloc_extensions.training.sampler import random_pixels
+from visloc_extensions.training.settings import Settings
 
 
 class Pairs(NamedTuple):

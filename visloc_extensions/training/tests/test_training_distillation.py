@@ -8,18 +8,18 @@ import pytest
 import torch
 
 from samples.papers import art_poster
-from training.checkpoint import FILE_NAME, load_state
-from training.distillation import Distillation, losses_of
-from training.export import export
-from training.files import read_about
-from training.pairs import Pairs, make_sources
-from training.photos import Photo, photo_levels
-from training.run import Trainer, train
-from training.settings import PRESETS, Settings
 from visloc.errors import InvalidInput
 from visloc.features.networks.xfeat.extractor import XFeatExtractor, network_input
 from visloc.features.networks.xfeat.load import load_xfeat
 from visloc.options import Inference
+from visloc_extensions.training.checkpoint import FILE_NAME, load_state
+from visloc_extensions.training.distillation import Distillation, losses_of
+from visloc_extensions.training.export import export
+from visloc_extensions.training.files import read_about
+from visloc_extensions.training.pairs import Pairs, make_sources
+from visloc_extensions.training.photos import Photo, photo_levels
+from visloc_extensions.training.run import Trainer, train
+from visloc_extensions.training.settings import PRESETS, Settings
 
 CPU = torch.device("cpu")
 SMOKE = replace(

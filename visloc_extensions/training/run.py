@@ -14,14 +14,14 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor, nn
 
-from training.checkpoint import FILE_NAME, State, load_state, save_state
-from training.distillation import Distillation
-from training.from_scratch import FromScratch
-from training.pairs import Sources
-from training.recorded import RecordedStep
-from training.settings import Settings
-from training.validation import Score
 from visloc.errors import VislocError, refuse
+from visloc_extensions.training.checkpoint import FILE_NAME, State, load_state, save_state
+from visloc_extensions.training.distillation import Distillation
+from visloc_extensions.training.from_scratch import FromScratch
+from visloc_extensions.training.pairs import Sources
+from visloc_extensions.training.recorded import RecordedStep
+from visloc_extensions.training.settings import Settings
+from visloc_extensions.training.validation import Score
 
 LOG_NAME = "log.jsonl"
 VALIDATION_NAME = "validation.jsonl"

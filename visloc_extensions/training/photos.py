@@ -19,9 +19,9 @@ from safetensors import SafetensorError
 from safetensors.numpy import load
 from torch import Tensor
 
-from training.files import read_about, write_tensors
 from visloc.errors import NotFound, refuse
 from visloc.photos.reading import read_photo
+from visloc_extensions.training.files import read_about, write_tensors
 
 VALIDATION = "validation"
 _RESEARCH_SUFFIX = "_research"  # of folders whose licences do not allow every use
@@ -105,7 +105,8 @@ def read_pack(path: Path) -> Pack:
     except (SafetensorError, LookupError, TypeError, ValueError) as error:
         raise refuse(
             "training.pack",
-            "this is not a pack of photos of this version; make one with: python -m training pack",
+            "this is not a pack of photos of this version; make one with: "
+            "python -m visloc_extensions.training pack",
             field=str(path),
             got=f"{type(error).__name__}: {error}",
         ) from error

@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from training.losses import (
+from visloc_extensions.training.losses import (
     AP_BINS,
     peakiness_loss,
     quantized_average_precision,

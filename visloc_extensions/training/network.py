@@ -14,7 +14,6 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from training.interpolation import weighted_squares
 from visloc.features.backends.convolution import folded
 from visloc.features.networks.r2d2.model import (
     DESCRIPTOR_DIM,
@@ -25,6 +24,7 @@ from visloc.features.networks.r2d2.model import (
     Architecture,
     R2D2Network,
 )
+from visloc_extensions.training.interpolation import weighted_squares
 
 Array = NDArray[Any]
 ARCHITECTURES = {each.name: each for each in (R2D2, FAST_R2D2)}

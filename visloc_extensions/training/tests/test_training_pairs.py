@@ -9,15 +9,20 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from training.atlas import levels_to_look_at, look, make_atlas
-from training.augmentation import augment
-from training.conditions import Conditions, draw_conditions
-from training.homographies import applied, pixel_centres, random_looks, strength_at
-from training.pairs import Sources, draw, make, make_pairs, make_sources
-from training.parallax import Rooms, View, make_rooms, other_view, random_views
-from training.photos import Photo, photo_levels
-from training.settings import Settings
 from visloc.geometry import Camera, Pose
+from visloc_extensions.training.atlas import levels_to_look_at, look, make_atlas
+from visloc_extensions.training.augmentation import augment
+from visloc_extensions.training.conditions import Conditions, draw_conditions
+from visloc_extensions.training.homographies import (
+    applied,
+    pixel_centres,
+    random_looks,
+    strength_at,
+)
+from visloc_extensions.training.pairs import Sources, draw, make, make_pairs, make_sources
+from visloc_extensions.training.parallax import Rooms, View, make_rooms, other_view, random_views
+from visloc_extensions.training.photos import Photo, photo_levels
+from visloc_extensions.training.settings import Settings
 
 CPU = torch.device("cpu")
 PLAIN = Settings(crop_px=64, batch=4, border_px=8, patch_px=8)

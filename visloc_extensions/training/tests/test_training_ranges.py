@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from training.__main__ import main
-from training.ranges import paint_pictures
 from visloc.features.backends.calibration import PICTURES, RECORDED
+from visloc_extensions.training.__main__ import main
+from visloc_extensions.training.ranges import paint_pictures
 
 
 def test_pictures_are_those_that_the_code_paints(tmp_path: Path) -> None:

@@ -2,8 +2,8 @@
 
 A photo is taken back to linear light. There its surfaces, the lamps, the air, the lens and the
 sensor act in the order in which light passes them; then it is developed, as a camera does, and
-compressed. What happens is drawn beforehand (``training.conditions``); the pixels stay on their
-device, and the same operations run whatever was drawn, so that a GPU can record them once.
+compressed. What happens is drawn beforehand (``conditions``); the pixels stay on their device, and
+the same operations run whatever was drawn, so that a GPU can record them once.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from training.conditions import BLOCK_PX, NOISE_STRIP, REACH_PX, Conditions
+from visloc_extensions.training.conditions import BLOCK_PX, NOISE_STRIP, REACH_PX, Conditions
 
 _GREY = (0.299, 0.587, 0.114)  # of RGB (ITU-R BT.601)
 

@@ -11,17 +11,17 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from training.atlas import levels_to_look_at, look, make_atlas
-from training.augmentation import augment
-from training.checkpoint import State
-from training.conditions import draw_conditions
-from training.export import export
-from training.homographies import Matrices, moved, random_looks
-from training.photos import Photo
 from visloc.features import LocalFeatureExtractor, make_local_features
 from visloc.matching.correspondences import mutual_nearest_neighbours
 from visloc.matching.products import round_descriptors
 from visloc.options import Extraction, Inference
+from visloc_extensions.training.atlas import levels_to_look_at, look, make_atlas
+from visloc_extensions.training.augmentation import augment
+from visloc_extensions.training.checkpoint import State
+from visloc_extensions.training.conditions import draw_conditions
+from visloc_extensions.training.export import export
+from visloc_extensions.training.homographies import Matrices, moved, random_looks
+from visloc_extensions.training.photos import Photo
 
 THRESHOLDS_PX = (1.0, 3.0, 5.0)
 SIDE_PX = 320

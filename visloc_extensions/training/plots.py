@@ -10,9 +10,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from training.run import LOG_NAME, VALIDATION_NAME
-from training.validation import THRESHOLDS_PX
 from visloc.errors import refuse
+from visloc_extensions.training.run import LOG_NAME, VALIDATION_NAME
+from visloc_extensions.training.validation import THRESHOLDS_PX
 
 _SMOOTH_SHARE = 0.02  # of the steps: single batches differ more than the network changes
 _PARTS = ("total", "peakiness", "reliability", "similarity")

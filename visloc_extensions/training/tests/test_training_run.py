@@ -12,20 +12,20 @@ import torch
 import torch.nn.functional as F
 
 from samples.papers import art_poster
-from training.__main__ import main
-from training.checkpoint import FILE_NAME, load_state
-from training.export import export
-from training.network import ARCHITECTURES, TrainableR2D2
-from training.pairs import make_sources
-from training.photos import Photo, photo_levels
-from training.run import LOG_NAME, Trainer, learning_rate, resume, train
-from training.settings import PRESETS, Settings
-from training.validation import features_of, validate, validation_pairs
 from visloc.errors import InvalidInput
 from visloc.features.networks.r2d2.extractor import R2D2Extractor
 from visloc.features.networks.r2d2.load import load_faster2d2
 from visloc.options import Inference
 from visloc.photos.reading import read_photo_file
+from visloc_extensions.training.__main__ import main
+from visloc_extensions.training.checkpoint import FILE_NAME, load_state
+from visloc_extensions.training.export import export
+from visloc_extensions.training.network import ARCHITECTURES, TrainableR2D2
+from visloc_extensions.training.pairs import make_sources
+from visloc_extensions.training.photos import Photo, photo_levels
+from visloc_extensions.training.run import LOG_NAME, Trainer, learning_rate, resume, train
+from visloc_extensions.training.settings import PRESETS, Settings
+from visloc_extensions.training.validation import features_of, validate, validation_pairs
 
 CPU = torch.device("cpu")
 SMOKE = PRESETS["smoke"]
@@ -248,4 +248,4 @@ def test_a_missing_pack_is_told_how_to_make(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["run", str(tmp_path / "run"), "--photos", str(tmp_path / "none")]) == 1
-    assert "python -m training pack" in capsys.readouterr().err
+    assert "python -m visloc_extensions.training pack" in capsys.readouterr().err

@@ -101,7 +101,7 @@ class Settings:
 
 PRESETS = {
     "published": Settings(),
-    # Measured on two processor cores, see docs/models/fast-r2d2.md.
+    # Measured on two processor cores, see README.md.
     "processor": Settings(
         steps=4_000,
         crop_px=128,
@@ -128,7 +128,7 @@ PRESETS = {
         weather_share=0.7,
         bf16=True,
     ),
-    # Measured on two processor cores, see docs/models/xfeat.md.
+    # Measured on two processor cores, see README.md.
     "distillation": Settings(
         architecture="xfeat",
         steps=1_500,
