@@ -27,7 +27,7 @@ ANY_KEY: Needed = frozenset()
 READ: Needed = frozenset({Scope.READ})
 
 # First parts of the paths of localization. Extensions add theirs before requests come.
-LOCALIZING = {"localize", "geopose"}
+LOCALIZING = {"localize"}
 _PUBLIC_PATHS = frozenset({"/healthz", "/readyz", "/openapi.json"})
 _READING_METHODS = frozenset({"GET", "HEAD"})
 

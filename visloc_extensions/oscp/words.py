@@ -14,7 +14,6 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import from_json
 
-from service.api.oscp_images import image_bytes
 from service.values import ImageJob, RigJob, photo_job
 from visloc.errors import inside, refuse
 from visloc.geometry import Camera, Pose
@@ -23,6 +22,7 @@ from visloc.types import MAX_RADIUS_M, Near, RigSensor
 from visloc_api.words.geopose import GeoPose
 from visloc_api.words.json_text import check_json_values, check_names, utf8_json
 from visloc_api.words.message import MAX_INSTANT_VALUES, refusal_of
+from visloc_extensions.oscp.images import image_bytes
 
 # A device is searched for so far around a position at least: cities make fixes worse than they say.
 _MIN_RADIUS_M = 100.0

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from service.api.oscp import GeoPoseRequest
-from service.api.oscp_images import image_bytes
 from service.http.openapi import example
-from service.http.oscp.routes import answer_kind
 from visloc.errors import InvalidInput, TooLarge, VislocError
 from visloc.types import Near
+from visloc_extensions.oscp.images import image_bytes
+from visloc_extensions.oscp.routes import answer_kind
+from visloc_extensions.oscp.words import GeoPoseRequest
 
-EXAMPLE_GEOPOSE_REQUEST_V1 = example("geopose_request_v1")
-EXAMPLE_GEOPOSE_REQUEST_V2 = example("geopose_request_v2")
+EXAMPLE_GEOPOSE_REQUEST_V1 = example("request_v1", "visloc_extensions.oscp")
+EXAMPLE_GEOPOSE_REQUEST_V2 = example("request_v2", "visloc_extensions.oscp")
 PHOTO = base64.b64decode(EXAMPLE_GEOPOSE_REQUEST_V1["sensorReadings"][0]["reading"]["imageBytes"])
 CAMERA: dict[str, Any] = {
     "timestamp": 1750939398316,

@@ -6,13 +6,14 @@ from typing import Any
 
 from service.http.openapi import example
 
+_HERE = "visloc_extensions.oscp"
 _REF = "#/components/schemas/{model}"
-_GEOPOSE_RESPONSE = example("geopose_response")
+_GEOPOSE_RESPONSE = example("response", _HERE)
 _CONTENT: dict[str, Any] = {
-    "schema": example("geopose_body"),
+    "schema": example("body", _HERE),
     "examples": {
-        "version2": {"value": example("geopose_request_v2")},
-        "version1": {"value": example("geopose_request_v1")},
+        "version2": {"value": example("request_v2", _HERE)},
+        "version1": {"value": example("request_v1", _HERE)},
     },
 }
 GEOPOSE_BODY: dict[str, Any] = {

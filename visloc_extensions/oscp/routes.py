@@ -13,17 +13,23 @@ from starlette.responses import Response
 
 from service.api.answers import geoposes_to_words
 from service.api.deadlines import within
-from service.api.oscp import GeoPoseAccuracy, GeoPoseRequest, GeoPoseResponse, GeoPoseStatus
 from service.http.backend import Backend, backend_of, limit_of
 from service.http.bodies import checked_media_type, parsed
 from service.http.openapi.app import problems
-from service.http.oscp.examples import GEOPOSE_BODY, GEOPOSE_RESPONSES
 from service.http.responses import json_response, problem_response, while_connected
+from service.security.access import LOCALIZING
 from service.settings import ServiceSettings
 from service.values import Localization, RigJob
 from visloc.errors import InvalidInput, refuse
 from visloc.geometry import Pose
 from visloc.geopose import accuracy_of
+from visloc_extensions.oscp.openapi import GEOPOSE_BODY, GEOPOSE_RESPONSES
+from visloc_extensions.oscp.words import (
+    GeoPoseAccuracy,
+    GeoPoseRequest,
+    GeoPoseResponse,
+    GeoPoseStatus,
+)
 
 OSCP = "application/vnd.oscp+json"
 OGC = "application/geopose+json"
@@ -37,6 +43,7 @@ _MAX_ID = 200
 
 def add_geopose_routes(app: FastAPI) -> None:
     """Add ``/geopose``."""
+    LOCALIZING.add("geopose")
     app.get("/geopose", response_model=GeoPoseStatus, responses=problems(422))(geopose_status)
     app.post(
         "/geopose",
