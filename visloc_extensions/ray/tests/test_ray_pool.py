@@ -17,14 +17,14 @@ from pathlib import Path
 import pytest
 from ray._raylet import Config
 
-from mapping.cluster import ray_pool
 from mapping.cluster.executors import open_executor
-from mapping.cluster.ray_pool import RayPool
 from mapping.cluster.storage import place_of
 from mapping.pipeline.build import build_map
 from mapping.pipeline.settings import BuildSettings
 from visloc.archive import Map, open_map
 from visloc.errors import InvalidInput, Unavailable
+from visloc_extensions.ray import pool as ray_pool
+from visloc_extensions.ray.pool import RayPool
 
 ROOT = Path(__file__).resolve().parents[3]
 # Ends with its input: also with a test process that is killed.

@@ -15,7 +15,7 @@ import jsonschema
 import pytest
 import yaml
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[3]
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +27,7 @@ def schema() -> dict[str, Any]:
 
 @pytest.fixture
 def example() -> dict[str, Any]:
-    text = (ROOT / "deploy" / "ray" / "cluster.yaml").read_text(encoding="utf-8")
+    text = (ROOT / "visloc_extensions" / "ray" / "cluster.yaml").read_text(encoding="utf-8")
     return yaml.safe_load(text)  # type: ignore[no-any-return]
 
 

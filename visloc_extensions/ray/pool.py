@@ -26,7 +26,7 @@ T = TypeVar("T")
 # The address of a new cluster on this machine, which ends with the build.
 LOCAL = "local"
 # How often Ray retries a batch whose worker or machine died. Batches that ran out of memory have
-# their own limit, see ``executors``.
+# their own limit, see ``executor``.
 _RETRIES = 3
 # Tasks and items are small: results do not travel through it.
 _OBJECT_STORE_BYTES = 256 * 2**20
