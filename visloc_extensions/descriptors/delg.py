@@ -23,7 +23,13 @@ import torch
 from numpy.typing import NDArray
 
 from visloc.features.base import GlobalDescriptor
-from visloc.features.descriptors.network_descriptor import (
+from visloc.features.descriptors.pooling import generalized_mean
+from visloc.features.descriptors.whitening import unit_rows
+from visloc.features.weights.checkpoint import Checkpoint
+from visloc.features.weights.files import PublishedWeights, check_shapes, read_weights
+from visloc.options import Inference
+from visloc.runtime.device import torch_device
+from visloc_extensions.descriptors.network_descriptor import (
     NetworkDescriptor,
     exponent_of,
     linear_layer,
@@ -31,13 +37,7 @@ from visloc.features.descriptors.network_descriptor import (
     shrunk_size,
     without_training,
 )
-from visloc.features.descriptors.pooling import generalized_mean
-from visloc.features.descriptors.whitening import unit_rows
-from visloc.features.networks.resnet import FEATURES, Layout, ResNet, depth_of, expected_shapes
-from visloc.features.weights.checkpoint import Checkpoint
-from visloc.features.weights.files import PublishedWeights, check_shapes, read_weights
-from visloc.options import Inference
-from visloc.runtime.device import torch_device
+from visloc_extensions.descriptors.resnet import FEATURES, Layout, ResNet, depth_of, expected_shapes
 
 SCALES = (1 / sqrt(2), 1.0, sqrt(2))
 MAX_LONG_SIDE_PX = 1024  # at scale 1, as the authors' configuration has it

@@ -15,9 +15,9 @@ from torch import Tensor, nn
 
 from visloc.errors import WeightsError
 from visloc.features import make_global_descriptor
-from visloc.features.descriptors.delg import LAYOUT, PUBLISHED, Delg, load_delg
-from visloc.features.networks.resnet import expected_shapes
 from visloc.types import LocalFeatures
+from visloc_extensions.descriptors.delg import LAYOUT, PUBLISHED, Delg, load_delg
+from visloc_extensions.descriptors.resnet import expected_shapes
 
 NOTHING = LocalFeatures(
     np.zeros((0, 2), np.float32), np.zeros(0, np.float32), np.zeros(0, np.float32),

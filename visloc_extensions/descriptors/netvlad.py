@@ -28,17 +28,17 @@ from torch import Tensor, nn
 from visloc.features.backends.convolution import Convolution
 from visloc.features.backends.torch import torch_convolution
 from visloc.features.base import GlobalDescriptor
-from visloc.features.descriptors.network_descriptor import (
-    NetworkDescriptor,
-    normalized,
-    shrunk_size,
-    without_training,
-)
 from visloc.features.descriptors.whitening import unit_rows
 from visloc.features.weights.checkpoint import Checkpoint
 from visloc.features.weights.files import PublishedWeights, check_shapes, read_weights
 from visloc.options import Inference
 from visloc.runtime.device import torch_device
+from visloc_extensions.descriptors.network_descriptor import (
+    NetworkDescriptor,
+    normalized,
+    shrunk_size,
+    without_training,
+)
 
 CLUSTERS = 64
 # Widths of the 3 x 3 convolutions, up to each halving of the resolution.

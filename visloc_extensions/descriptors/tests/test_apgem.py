@@ -15,11 +15,11 @@ from torch import Tensor, nn
 
 from visloc.errors import WeightsError
 from visloc.features import make_global_descriptor
-from visloc.features.descriptors.apgem import PCA_NAME, PUBLISHED, ApGem, load_apgem, whitened
-from visloc.features.descriptors.network_descriptor import NetworkDescriptor
 from visloc.features.weights.checkpoint import read_checkpoint
-from visloc.features.weights.pickled_pca import PrincipalComponents
 from visloc.types import LocalFeatures
+from visloc_extensions.descriptors.apgem import PCA_NAME, PUBLISHED, ApGem, load_apgem, whitened
+from visloc_extensions.descriptors.network_descriptor import NetworkDescriptor
+from visloc_extensions.descriptors.principal_components import PrincipalComponents
 
 NOTHING = LocalFeatures(
     np.zeros((0, 2), np.float32), np.zeros(0, np.float32), np.zeros(0, np.float32),

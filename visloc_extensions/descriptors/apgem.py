@@ -20,7 +20,13 @@ from numpy.typing import NDArray
 
 from visloc.errors import refuse
 from visloc.features.base import GlobalDescriptor
-from visloc.features.descriptors.network_descriptor import (
+from visloc.features.descriptors.pooling import generalized_mean
+from visloc.features.descriptors.whitening import unit_rows
+from visloc.features.weights.checkpoint import Checkpoint
+from visloc.features.weights.files import PublishedWeights, check_shapes, read_weights
+from visloc.options import Inference
+from visloc.runtime.device import torch_device
+from visloc_extensions.descriptors.network_descriptor import (
     NetworkDescriptor,
     exponent_of,
     linear_layer,
@@ -28,14 +34,11 @@ from visloc.features.descriptors.network_descriptor import (
     shrunk_size,
     without_training,
 )
-from visloc.features.descriptors.pooling import generalized_mean
-from visloc.features.descriptors.whitening import unit_rows
-from visloc.features.networks.resnet import FEATURES, TORCHVISION, ResNet, expected_shapes
-from visloc.features.weights.checkpoint import Checkpoint
-from visloc.features.weights.files import PublishedWeights, check_shapes, read_weights
-from visloc.features.weights.pickled_pca import PrincipalComponents, principal_components
-from visloc.options import Inference
-from visloc.runtime.device import torch_device
+from visloc_extensions.descriptors.principal_components import (
+    PrincipalComponents,
+    principal_components,
+)
+from visloc_extensions.descriptors.resnet import FEATURES, TORCHVISION, ResNet, expected_shapes
 
 DEPTH = 101
 # The authors describe photos as large as they are; their time grows with the pixels, and 1024 is

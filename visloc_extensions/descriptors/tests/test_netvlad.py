@@ -13,8 +13,8 @@ from torch import Tensor, nn
 
 from visloc.errors import WeightsError
 from visloc.features import make_global_descriptor
-from visloc.features.descriptors.netvlad import PUBLISHED, NetVlad, load_netvlad, vlad
 from visloc.types import LocalFeatures
+from visloc_extensions.descriptors.netvlad import PUBLISHED, NetVlad, load_netvlad, vlad
 
 NOTHING = LocalFeatures(
     np.zeros((0, 2), np.float32), np.zeros(0, np.float32), np.zeros(0, np.float32),
