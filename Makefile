@@ -129,7 +129,7 @@ fuzz-api: install ## send CASES requests made from our OpenAPI
 	$(BIN)/python -m tests.fuzz.api --cases $(or $(CASES),5000)
 
 train-smoke: install ## train 20 steps on the sample: the loss falls
-	$(BIN)/pytest tests/training/test_training_run.py -k twenty_steps
+	$(BIN)/pytest visloc_extensions/training/tests/test_training_run.py -k twenty_steps
 
 bench: install ## seconds and accuracy beside the peer and the machine's limit, of DATASET with FEATURES
 	$(BIN)/python -m benchmarks.speed $(or $(DATASET),../shared/data/redkitchen) \

@@ -180,7 +180,7 @@ RULES = (
     Rule(Tier.PARSED, r"mapping\.md", r"mapping edit", "needs those photos; test_sizing.py"),
     Rule(Tier.PARSED, r"mapping\.md", r".* recorded .* rgbd", "needs a recording with depth"),
     Rule(Tier.PARSED, r"operations", r"visloc-service --host 0\.0", "would listen to the network"),
-    Rule(Tier.PARSED, r"operations", r"mapping .* --executor ray", "tests/test_ray_cluster.py"),
+    Rule(Tier.PARSED, r"visloc_extensions/ray", r"mapping .* --executor ray", "needs a cluster"),
     *(
         Rule(Tier.RUN, r"results\.md", pattern)
         for pattern in (
@@ -201,7 +201,7 @@ RULES = (
     Rule(Tier.PARSED, r"results|rigs-and|scale\.md|performance", r"", _HOURS),
     Rule(Tier.PARSED, r"operations|decisions", r"(\w+=\S+ )*python -m benchmarks", _HOURS),
     Rule(Tier.PARSED, r"living_maps|map-sets|mapping\.md", r"python ", _HOURS),
-    Rule(Tier.PARSED, r"models/", r"", "hours of training; tests/training"),
+    Rule(Tier.PARSED, r"visloc_extensions/training", r"", "hours of training"),
 )
 PROGRAMS = (
     *("mapping", "localize", "visloc-service", "python", "make"),

@@ -7,10 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-PACKAGES = (
-    *("visloc", "mapping", "service", "clients", "visloc_api", "training"),
-    "visloc_extensions",
-)
+PACKAGES = ("visloc", "mapping", "service", "clients", "visloc_api", "visloc_extensions")
 
 
 def mapped() -> Iterator[str]:

@@ -317,7 +317,6 @@ def test_every_command_is_known_and_parses(page: Path) -> None:
         ),
         ("python -m benchmarks.retrieval maps/ID", True, False),
         ("python benchmarks/no_such_file.py", True, False),
-        ("python -m training no-such-command", True, False),
         ("visloc-service --no-such-flag", True, False),
         ("make no-such-target", True, False),
         ('ARGS="--no-such-flag" make bench', True, False),

@@ -10,7 +10,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = (
-    *("visloc", "mapping", "service", "clients", "samples", "training", "visloc_api"),
+    *("visloc", "mapping", "service", "clients", "samples", "visloc_api"),
     *("visloc_extensions", "benchmarks"),
 )
 # Names of faiss's functions and classes that parse what they are given.

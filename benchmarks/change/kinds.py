@@ -1,6 +1,6 @@
 """Ten kinds of change of a photo whose pose stays known, each in three strengths.
 
-Light, air, lens and sensor are those of ``training.augmentation``, in linear light. Compression is
+Light, air, lens and sensor are those of the extension ``training``, in linear light. Compression is
 libjpeg's. What is moved or missing is rendered anew in the painted room, where truth is exact.
 """
 
@@ -10,6 +10,7 @@ import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -19,10 +20,11 @@ from numpy.typing import NDArray
 from benchmarks.trust.queries import resized_to
 from samples.render import render_photo
 from samples.scene import NUM_SURFACES, Rectangle, Scene, make_room
-from training.augmentation import augment
-from training.conditions import Conditions, draw_conditions
 from visloc.geometry import Camera, Pose
 from visloc.photos.reading import Photo
+
+if TYPE_CHECKING:
+    from visloc_extensions.training.conditions import Conditions
 
 Taken = tuple[Photo, Camera]
 _ROOM_SEED, _OTHER_SEED = 0, 1000
@@ -79,12 +81,20 @@ def _room(share: float) -> Scene:
     return Scene(tuple(kept))
 
 
+def _drawn(rng: np.random.Generator, night: float) -> Conditions:
+    from visloc_extensions.training.conditions import draw_conditions
+
+    return draw_conditions(rng, 1, night, night, 0.0)
+
+
 def _nothing(rng: np.random.Generator) -> Conditions:
-    return draw_conditions(rng, 1, 0.0, 0.0, 0.0)
+    return _drawn(rng, 0.0)
 
 
 def _with(photo: Photo, conditions: Conditions) -> Photo:
     """Apply conditions to a photo, padded to whole blocks."""
+    from visloc_extensions.training.augmentation import augment
+
     height, width = photo.height, photo.width
     below, right = -height % _BLOCK, -width % _BLOCK
     rgb = cv2.copyMakeBorder(photo.rgb, 0, below, 0, right, cv2.BORDER_REFLECT)
@@ -101,7 +111,7 @@ def _one(value: float) -> NDArray[np.float64]:
 def _darkness(photo: Photo, camera: Camera, strength: float, rng: np.random.Generator) -> Taken:
     """Take it at night, by a few lamps, with fewer electrons the darker it is."""
     electrons = 2000.0 / strength**2
-    night = draw_conditions(rng, 1, 1.0, 1.0, 0.0)
+    night = _drawn(rng, 1.0)
     conditions = _nothing(rng)._replace(
         night=_one(1.0),
         ambient=_one(0.3 / strength),

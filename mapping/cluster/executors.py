@@ -1,8 +1,7 @@
-"""The executors of a build's work: processes of this machine, or a Ray cluster."""
+"""The executors of a build's work: processes of this machine, or what an extension adds."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from typing import Protocol, TypeVar
@@ -10,21 +9,12 @@ from typing import Protocol, TypeVar
 from mapping.cluster.stage_timings import Spent
 from mapping.cluster.workers import Workers
 from mapping.progress import ItemProgress, Progress
-from visloc.errors import refuse
+from visloc.extensions import EXECUTORS, extensions, load
 
 S = TypeVar("S")
 T = TypeVar("T")
 
-EXECUTORS = ("local", "ray")
-# Ray reads these when it is loaded. It reports no usage statistics. Workers see the GPUs of their
-# machine. An address where nothing listens is an error within a minute, not thirteen. A batch that
-# runs out of memory is retried as often as one whose worker died, not for ever.
-_RAY_SETTINGS = {
-    "RAY_USAGE_STATS_ENABLED": "0",
-    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
-    "RAY_NUM_REDIS_GET_RETRIES": "1",
-    "RAY_task_oom_retries": "3",
-}
+LOCAL = "local"
 
 
 class Executor(Protocol):
@@ -71,19 +61,20 @@ class Executor(Protocol):
         """
 
 
+def executor_names() -> list[str]:
+    """Return the names of all executors."""
+    return [LOCAL, *extensions(EXECUTORS)]
+
+
 def open_executor(name: str, workers: int, ray_address: str) -> AbstractContextManager[Executor]:
-    """Return an executor of ``EXECUTORS``, which ends with its ``with`` block.
+    """Return an executor of ``executor_names()``, which ends with its ``with`` block.
 
     Raises:
-        InvalidInput: ``build.no_ray``.
-        Unavailable: ``build.no_cluster``.
+        VislocError: what an extension refuses.
     """
-    if name == "local":
+    if name == LOCAL:
         return Workers(workers)
-    for setting, value in _RAY_SETTINGS.items():
-        os.environ.setdefault(setting, value)
-    try:
-        from mapping.cluster.ray_pool import RayPool  # ray is optional
-    except ImportError as error:
-        raise refuse("build.no_ray", field="--executor", got=str(error)) from error
-    return RayPool(workers, ray_address)
+    opened: AbstractContextManager[Executor] = load(extensions(EXECUTORS)[name])(
+        workers, ray_address
+    )
+    return opened

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from pydantic import JsonValue
 
-from mapping.cluster.executors import Executor, open_executor
+from mapping.cluster.executors import LOCAL, Executor, open_executor
 from mapping.cluster.stage_timings import Costs
 from mapping.cluster.storage import (
     open_store,
@@ -98,7 +98,7 @@ def build_map(
         DatasetError, WeightsError, InvalidInput: with the file or the setting that is wrong.
         Unavailable: ``storage.failed`` when the disk is full or broken; what executors raise.
     """
-    if settings.executor != "local" and settings.inference is Inference.AUTO:
+    if settings.executor != LOCAL and settings.inference is Inference.AUTO:
         # Chosen for this machine; otherwise each machine of a cluster would choose for itself.
         settings = replace(settings, inference=choose_inference(settings.inference))
     check_settings(settings)

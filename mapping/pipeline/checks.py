@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from mapping.cluster.executors import EXECUTORS
+from mapping.cluster.executors import executor_names
 from mapping.cluster.storage import is_remote, lies_in, work_place
 from mapping.frames.anchor import MAX_DIRECTION_ERROR_DEG, known_positions
 from mapping.methods.known_model import refuse_without_points
@@ -38,7 +38,7 @@ def check_settings(settings: BuildSettings) -> None:
     """
     if settings.method not in METHODS:
         raise refuse("build.method", field="--method", expected=METHODS, got=settings.method)
-    check_names("--executor", (settings.executor,), EXECUTORS)
+    check_names("--executor", (settings.executor,), executor_names())
     if settings.masks is not None and is_ready_made(settings.local_features):
         raise refuse("masks.ready_made", field="--masks", got=settings.local_features)
     _refuse_mixed_places(settings)

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from mapping.cluster.executors import EXECUTORS
+from mapping.cluster.executors import LOCAL
 from mapping.cluster.storage import place_of
 from mapping.methods.retrieval_only import RETRIEVAL_ONLY
 from mapping.methods.rgbd import DepthSettings
@@ -153,7 +153,7 @@ class BuildSettings:
         _cluster_option(
             help="Where the workers run. local: on this machine. ray: on a Ray cluster."
         ),
-    ] = EXECUTORS[0]
+    ] = LOCAL
     ray_address: Annotated[
         str,
         _cluster_option(

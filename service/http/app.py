@@ -17,7 +17,6 @@ from service.http.health import add_health_routes
 from service.http.localize import add_localize_routes
 from service.http.maps import add_map_routes
 from service.http.openapi.app import App
-from service.http.oscp.routes import add_geopose_routes
 from service.http.responses import problem_response
 from service.http.scenes import add_scene_routes
 from service.http.static_page import add_page_routes
@@ -50,7 +49,6 @@ def create_app(backend: Backend) -> App:
     add_health_routes(app)
     add_map_routes(app)
     add_scene_routes(app)
-    add_geopose_routes(app)
     for entry in extensions(HTTP_ROUTES).values():
         load(entry)(app)
     if settings.page:

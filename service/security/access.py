@@ -26,6 +26,8 @@ ANY_KEY: Needed = frozenset()
 
 READ: Needed = frozenset({Scope.READ})
 
+# First parts of the paths of localization. Extensions add theirs before requests come.
+LOCALIZING = {"localize"}
 _PUBLIC_PATHS = frozenset({"/healthz", "/readyz", "/openapi.json"})
 _READING_METHODS = frozenset({"GET", "HEAD"})
 
@@ -63,7 +65,7 @@ def needed_over_http(method: str, path: str, *, page: bool = False) -> Needed:
     if path in _PUBLIC_PATHS or (page and _is_of_page(method, path)):
         return NOTHING
     match path.split("/")[1:2]:
-        case ["localize" | "geopose"]:
+        case [first] if first in LOCALIZING:
             return frozenset({Scope.LOCALIZE})
         case ["maps"]:
             return frozenset({Scope.READ if method in _READING_METHODS else Scope.MANAGE})

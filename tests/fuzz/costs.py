@@ -17,7 +17,7 @@ import struct
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -30,7 +30,6 @@ from google.protobuf.message import DecodeError
 from PIL import Image
 
 from service.api import jobs
-from service.api.oscp import GeoPoseRequest
 from service.grpc.messages import rig_job_of
 from service.grpc.reading import reader_of
 from service.http.bodies import max_sequence_values
@@ -52,8 +51,8 @@ _MOST_BYTES = 64 * 2**20
 _MAX_ADDRESS_SPACE = 4 * 2**30
 _MAX_CPU_S = 300
 _SIDE = 7000
-_SETTINGS = ServiceSettings()
-_LIMITS = BatchLimits(_SETTINGS.max_rig_images, _SETTINGS.max_instants)
+SETTINGS = ServiceSettings()
+_LIMITS = BatchLimits(SETTINGS.max_rig_images, SETTINGS.max_instants)
 
 
 @dataclass(frozen=True)
@@ -173,7 +172,7 @@ def _photos(kind: str) -> Parser:
         for code in (">H", "<H", ">I", "<I")
     )
     made = tuple(Input(data, b"", b"") for data in starts)
-    return Parser("in a worker", _SETTINGS.max_image_bytes, read_photo, made, words)
+    return Parser("in a worker", SETTINGS.max_image_bytes, read_photo, made, words)
 
 
 def _said_to_be_large(data: bytes) -> bytes:
@@ -184,7 +183,7 @@ def _said_to_be_large(data: bytes) -> bytes:
     return data
 
 
-def _json(read: Callable[[bytes], object], path: bytes, max_bytes: int) -> Parser:
+def json_parser(read: Callable[[bytes], object], path: bytes, max_bytes: int) -> Parser:
     words = (
         *(b'"', b"\\", b'\\"', b"\\u00e4", b",", b":", b"[", b"]", b"{", b"}", b"{}", b"[]", b"0"),
         *(b"-1e308", b"0.1", b"true", b" ", b"A", b"A" * 500, "ä".encode(), b'"a":0', b'"image":'),
@@ -217,42 +216,35 @@ def _head_and_body(data: bytes) -> None:
 
 def parsers() -> dict[str, Callable[[], Parser]]:
     """Return what reads strangers' bytes, by name."""
-    batch, crlf = _SETTINGS.max_batch_bytes, b"\r\n"
-    most = max_sequence_values(_SETTINGS)
+    batch, crlf = SETTINGS.max_batch_bytes, b"\r\n"
+    most = max_sequence_values(SETTINGS)
     form = b'--b\r\nContent-Disposition: form-data; name="image"; filename="a"\r\n\r\n'
     form_limits = FormLimits(32_001, batch)
     chunked = b"POST / HTTP/1.1\r\nHost: a\r\nTransfer-Encoding: chunked\r\n\r\n"
     return {
         **{f"photo: {kind}": lambda kind=kind: _photos(kind) for kind in _KINDS},
-        "JSON of a photo, its priors and options": lambda: _json(
+        "JSON of a photo, its priors and options": lambda: json_parser(
             lambda data: jobs.photo_job_of(LocalizeRequest.read_json(data)),
             b'"image":',
-            _SETTINGS.max_json_bytes,
+            SETTINGS.max_json_bytes,
         ),
-        "JSON of features": lambda: _json(
+        "JSON of features": lambda: json_parser(
             lambda data: jobs.photo_job_of(LocalizeRequest.read_json(data)),
             b'"features":{"kind":"sift","keypoints":{"dtype":"float32","shape":[1,2],"data":',
-            _SETTINGS.max_json_bytes,
+            SETTINGS.max_json_bytes,
         ),
-        "JSON of a rig": lambda: _json(
+        "JSON of a rig": lambda: json_parser(
             lambda data: jobs.rig_job_of(
                 LocalizeRigRequest.read_json(data, _LIMITS, MAX_INSTANT_VALUES), {}
             ),
             b'"images":',
             batch,
         ),
-        "JSON of a sequence": lambda: _json(
+        "JSON of a sequence": lambda: json_parser(
             lambda data: jobs.sequence_jobs_of(
                 LocalizeSequenceRequest.read_json(data, _LIMITS, most), {}
             ),
             b'"instants":',
-            batch,
-        ),
-        "GeoPose (OSCP)": lambda: _json(
-            lambda data: GeoPoseRequest.read_json(data).to_job(
-                max_image_bytes=_SETTINGS.max_image_bytes, max_images=_SETTINGS.max_rig_images
-            ),
-            b'"sensorReadings":',
             batch,
         ),
         "multipart": lambda: Parser(
@@ -310,9 +302,9 @@ def _in_child(make: Callable[[], Parser], seconds: float, seed: int, answer: Con
     answer.send((parser.where, search(parser, seconds, seed)))
 
 
-def main() -> int:
+def main(parsers: Mapping[str, Callable[[], Parser]]) -> int:
     """Search in a process for each parser, and print a row for it."""
-    given = argparse.ArgumentParser(prog="python -m tests.fuzz.costs", description=__doc__)
+    given = argparse.ArgumentParser(description=__doc__)
     given.add_argument("--seconds", type=float, default=20.0, help="of search for each parser")
     given.add_argument("--seed", type=int, default=1)
     options = given.parse_args()
@@ -321,7 +313,7 @@ def main() -> int:
         "|---|---|---|---|\n"
     )
     context = multiprocessing.get_context("fork")
-    for name, make in parsers().items():
+    for name, make in parsers.items():
         ours, theirs = context.Pipe(duplex=False)
         child = context.Process(
             target=_in_child, args=(make, options.seconds, options.seed, theirs)
@@ -349,4 +341,4 @@ def _size(size: int) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(parsers()))

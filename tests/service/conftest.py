@@ -96,6 +96,16 @@ def serve() -> Callable[..., AbstractContextManager[Doors]]:
 
 
 @pytest.fixture(scope="session")
+def anchored_maps(built_maps: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The map ``room``, tied to the Earth."""
+    from tests.service.anchored import write_anchored
+
+    maps = tmp_path_factory.mktemp("anchored") / "maps"
+    write_anchored(built_maps, maps)
+    return maps
+
+
+@pytest.fixture(scope="session")
 def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dataset of another room than the sample's."""
     from tests.service.map_sets import write_study

@@ -12,7 +12,6 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from service.api.oscp import GeoPoseRequest
 from service.http.openapi import example
 from tests.service.conftest import Doors
 from visloc.errors import InvalidInput
@@ -41,8 +40,6 @@ def shortened(value: Any) -> Any:
         (LocalizeRequest.read_json, example("features_request")),
         (LocalizeRigRequest.read_json, example("rig_request")),
         (LocalizeSequenceRequest.read_json, example("sequence_request")),
-        (GeoPoseRequest.read_json, example("geopose_request_v1")),
-        (GeoPoseRequest.read_json, example("geopose_request_v2")),
         (UseVersionRequest.read_json, {"version": "1"}),
     ],
 )

@@ -1,14 +1,11 @@
-"""GeoPoses of a map that is tied to the Earth, over both doors and in the OSCP protocol."""
+"""GeoPoses of a map that is tied to the Earth, over both doors."""
 
 from __future__ import annotations
 
-import base64
-import math
-import shutil
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import grpc
 import numpy as np
@@ -16,30 +13,15 @@ import pytest
 from google.protobuf.json_format import MessageToDict
 
 from clients import Client, Near, RigImage, RigSensor
-from mapping.frames.georeference import given_place, publish_anchored
-from visloc.archive import MapStore
+from tests.service.anchored import LATITUDE, LONGITUDE, is_near, true_geopose
 from visloc.geometry import Pose
-from visloc.geopose import geopose_of
 from visloc_api.v1 import localization_pb2 as pb2
 
 if TYPE_CHECKING:
     from conftest import Query
     from tests.service.conftest import Doors
 
-LATITUDE, LONGITUDE, ALTITUDE = 45.2178, 5.8083, 310.0
 PLACE = Near(LATITUDE, LONGITUDE, 50.0)
-
-
-@pytest.fixture(scope="module")
-def anchored_maps(built_maps: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The map ``room``, its x axis pointing north, and ``hall``, the same without a place."""
-    maps = tmp_path_factory.mktemp("anchored") / "maps"
-    shutil.copytree(built_maps, maps)
-    room = MapStore(maps).open("room")
-    place = (LATITUDE, LONGITUDE, ALTITUDE)
-    found = given_place(room, place, 90.0, accuracy=0.1, gravity=(0.0, 0.0, -1.0))
-    publish_anchored(room, found, maps, force=False)
-    return maps
 
 
 @pytest.fixture(scope="module")
@@ -48,57 +30,6 @@ def doors(
 ) -> Iterator[Doors]:
     with serve(anchored_maps, max_batch_bytes=600_000, max_rig_images=3) as doors:
         yield doors
-
-
-def camera_reading(query: Query, sensor: str = "cam0") -> dict[str, Any]:
-    camera = query.camera
-    return {
-        "timestamp": 1750939398300,
-        "sensorId": sensor,
-        "sequenceNumber": 0,
-        "imageFormat": "RGBA32",  # as a published client says of its JPEG
-        "size": [camera.width, camera.height],
-        "imageBytes": base64.b64encode(query.image).decode(),
-        "params": {"model": camera.model, "modelParams": list(camera.params)},
-    }
-
-
-def oscp_request(*readings: dict[str, Any], at: tuple[float, float] | None) -> dict[str, Any]:
-    positions = (
-        []
-        if at is None
-        else [{"sensorId": "gps0", "latitude": at[0], "longitude": at[1], "accuracy": 8.0}]
-    )
-    return {
-        "id": "7d7b6c1e-5f0f-4a52-9f5a-1c1a3c9b2d10",
-        "timestamp": 1750939398316,
-        "type": "geopose",
-        "sensors": [{"id": "cam0", "type": "camera"}, {"id": "gps0", "type": "geolocation"}],
-        "sensorReadings": {"cameraReadings": list(readings), "geolocationReadings": positions},
-    }
-
-
-def true_geopose(anchored_maps: Path, cam_from_world: Pose) -> dict[str, Any]:
-    geodetic = MapStore(anchored_maps).open("room").geodetic
-    assert geodetic is not None
-    found = geopose_of(cam_from_world, geodetic)
-    w, x, y, z = found.quaternion_wxyz.tolist()
-    return {
-        "position": {"lat": found.latitude, "lon": found.longitude, "h": found.height},
-        "quaternion": {"x": x, "y": y, "z": z, "w": w},
-    }
-
-
-def is_near(found: dict[str, Any], true: dict[str, Any]) -> bool:
-    """Within half a metre and three degrees."""
-    f, t = found["position"], true["position"]
-    metres = math.hypot(
-        (f["lat"] - t["lat"]) * 111_000,
-        (f["lon"] - t["lon"]) * 111_000 * math.cos(math.radians(LATITUDE)),
-        f["h"] - t["h"],
-    )
-    dot = sum(found["quaternion"][name] * true["quaternion"][name] for name in "xyzw")
-    return metres < 0.5 and 2 * math.acos(min(abs(dot), 1.0)) < math.radians(3)
 
 
 def test_answers_carry_geoposes_and_are_the_same_over_both_doors(
@@ -143,77 +74,6 @@ def test_a_rig_has_a_geopose_too(doors: Doors, query: Query) -> None:
     np.testing.assert_allclose(
         instant.geopose.quaternion_xyzw, photo.geopose.quaternion_xyzw, atol=0.02
     )
-
-
-@pytest.mark.parametrize("at", [(LATITUDE, LONGITUDE), None])
-def test_the_protocol_answers_where_the_photo_was_taken(
-    doors: Doors, anchored_maps: Path, query: Query, at: tuple[float, float] | None
-) -> None:
-    assert doors.http.get("/geopose").json() == {"status": "running"}
-    accept = "application/vnd.oscp+json; version=2.0;"
-    asked = oscp_request(camera_reading(query), at=at)
-    answer = doors.http.post("/geopose", json=asked, headers={"Accept": accept})
-    assert answer.status_code == 200, answer.text
-    assert answer.headers["content-type"] == "application/vnd.oscp+json; version=2.0"
-    found = answer.json()
-    assert list(found) == ["id", "timestamp", "accuracy", "type", "geopose"]
-    assert (found["id"], found["timestamp"]) == (asked["id"], asked["timestamp"])
-    assert found["type"] == "geopose"
-    assert is_near(found["geopose"], true_geopose(anchored_maps, query.cam_from_world))
-    assert 0 < found["accuracy"]["position"] < 0.5
-    assert 0 < found["accuracy"]["orientation"] < 3
-    bare = doors.http.post("/geopose", json=asked, headers={"Accept": "application/geopose+json"})
-    assert bare.headers["content-type"] == "application/geopose+json"
-    assert bare.json() == found["geopose"]
-
-
-def test_version_1_and_photos_of_a_rig_are_answered_the_same(
-    doors: Doors, anchored_maps: Path, query: Query
-) -> None:
-    reading = camera_reading(query)
-    params = reading.pop("params")
-    wrapped = {"timestamp": 1, "sensorId": "cam0", "reading": reading}
-    first: dict[str, Any] = {
-        "id": "version 1",
-        "sensors": [{"id": "cam0", "type": "camera", "params": params}],
-        "sensorReadings": [wrapped],
-    }
-    answer = doors.http.post("/geopose", json=first)
-    assert answer.status_code == 200, answer.text
-    assert answer.headers["content-type"] == "application/json"
-    true = true_geopose(anchored_maps, query.cam_from_world)
-    assert is_near(answer.json()["geopose"], true)
-
-    # A rig that lies on its side, so that its frame is not that of its cameras.
-    turned = {"x": 0, "y": 0, "z": math.sqrt(0.5), "w": math.sqrt(0.5)}
-    mount = {"type": "camera", "rigIdentifier": "phone", "rigRotation": turned}
-    mount["rigTranslation"] = {"x": 0.1, "y": 0.2, "z": 0.3}
-    rig = oscp_request(camera_reading(query), camera_reading(query, "cam1"), at=None)
-    rig["sensors"] = [{"id": "cam0", **mount}, {"id": "cam1", **mount}]
-    answer = doors.http.post("/geopose", json=rig)
-    assert answer.status_code == 200, answer.text
-    assert is_near(answer.json()["geopose"], true)
-    assert 0 < answer.json()["accuracy"]["position"] < 0.5
-
-
-def test_no_pose_no_map_and_no_such_answer_are_told_apart(
-    doors: Doors, query: Query, photos_of_another_room: list[Path]
-) -> None:
-    elsewhere = camera_reading(query) | {
-        "imageBytes": base64.b64encode(photos_of_another_room[0].read_bytes()).decode()
-    }
-    asked = oscp_request(camera_reading(query), at=(LATITUDE, LONGITUDE))
-    for body, headers, status, code in (
-        (oscp_request(elsewhere, at=None), {}, 404, "geopose.not_localized"),
-        (oscp_request(camera_reading(query), at=(-12.0, 30.0)), {}, 404, "map.none_near"),
-        (oscp_request(at=None), {}, 422, "geopose.no_camera"),
-        (asked, {"Accept": "application/vnd.oscp+json; version=3.0"}, 406, "geopose.accept"),
-        (asked, {"Content-Type": "text/plain"}, 422, "request.content_type"),
-    ):
-        answer = doors.http.post("/geopose", json=body, headers=headers)
-        assert answer.status_code == status, answer.text
-        assert answer.headers["content-type"] == "application/problem+json"
-        assert answer.json()["code"] == code
 
 
 def test_places_that_are_none_are_refused_alike(doors: Doors, query: Query) -> None:

@@ -49,13 +49,10 @@ LOCAL_FEATURES: Mapping[str, tuple[str, str]] = {
     "xfeat": ("visloc.features.networks.xfeat.load", "load_xfeat"),
 }
 GLOBAL_FEATURES: Mapping[str, tuple[str, str]] = {
-    "apgem": ("visloc.features.descriptors.apgem", "load_apgem"),
     "convvlad": ("visloc.features.descriptors.convvlad", "load_convvlad"),
-    "delg": ("visloc.features.descriptors.delg", "load_delg"),
     "densevlad": ("visloc.features.descriptors.densevlad", "load_densevlad"),
     "gem": ("visloc.features.descriptors.gem", "load_gem"),
     "localvlad": ("visloc.features.descriptors.localvlad", "load_localvlad"),
-    "netvlad": ("visloc.features.descriptors.netvlad", "load_netvlad"),
 }
 # XFeat is free for any use and fast; R2D2's published weights are for research only.
 DEFAULT_LOCAL_FEATURES = "xfeat"

@@ -436,9 +436,10 @@ def test_a_build_on_a_cluster_computes_as_suits_the_machine_that_begins_it(
         asked.append(networks.inference)
         raise Stopped
 
+    monkeypatch.setattr(mapping.pipeline.checks, "executor_names", lambda: ["local", "cluster"])
     monkeypatch.setattr(mapping.pipeline.build, "open_executor", lambda *_: Workers(1))
     monkeypatch.setattr(mapping.pipeline.build, "local_features_source", note_source)
-    for executor in ("local", "ray"):
+    for executor in ("local", "cluster"):
         with pytest.raises(Stopped):
             build_map(settings_for(sample / "mapping", tmp_path, executor=executor), quiet)
     assert asked == [Inference.AUTO, choose_inference(Inference.AUTO)]

@@ -59,7 +59,6 @@ FRAMINGS: dict[str, tuple[bytes, ...]] = {
     "chunk of no hex, expected": chunked(b"zz\r\n", more=EXPECT),
     "chunk of no hex, rig": chunked(b"zz\r\n", b"POST /localize/rig", JSON),
     "chunk of no hex, sequence": chunked(b"zz\r\n", b"POST /localize/sequence", JSON),
-    "chunk of no hex, GeoPose": chunked(b"zz\r\n", b"POST /geopose", JSON),
     "chunk of no hex after a good one": chunked(b"2\r\n{}\r\nzz\r\n"),
     "chunk with prefix 0x": chunked(b"0x5\r\nabcde\r\n0\r\n\r\n"),
     "chunk with plus": chunked(b"+5\r\nabcde\r\n0\r\n\r\n"),

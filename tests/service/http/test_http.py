@@ -365,7 +365,6 @@ def test_a_form_that_is_not_one_is_refused(doors: Any) -> None:
         ("POST", "/localize?camera=PINHOLE,1,1,1,1,1,1", "request.unknown_field", "camera"),
         ("POST", "/localize?debug=true&top_k=2", "request.unknown_field", "debug"),
         ("POST", "/localize/rig?ypr", "request.unknown_field", "ypr"),
-        ("POST", "/geopose?map=room", "request.unknown_field", "map"),
         ("PUT", "/maps/room/versions/2?current=true", "request.unknown_field", "current"),
         ("GET", "/maps?nera=1,2,3", "request.unknown_field", "nera"),
         ("GET", "/maps?near=1,2,3&near=4,5,6", "request.duplicate_field", "near"),
@@ -403,7 +402,7 @@ def test_head_has_the_headers_of_get_and_no_body(path: str, doors: Any) -> None:
         ({"Content-Type": "application/json; charset=latin1"}, "request.content_type", None),
     ],
 )
-@pytest.mark.parametrize("path", ["/localize", "/localize/rig", "/geopose", "/maps/room/current"])
+@pytest.mark.parametrize("path", ["/localize", "/localize/rig", "/maps/room/current"])
 def test_encodings_that_are_not_read_are_named(
     path: str, headers: dict[str, str], code: str, field: str | None, doors: Any
 ) -> None:
@@ -494,14 +493,10 @@ def test_the_work_for_a_client_that_hung_up_is_given_up(
         ("/localize", '{"map": "room", "map": "hall", "image": "AAAA"}'),
         ("/localize", '{"map": "room", "image": "AAAA", "options": {"top_k": 1, "top_k": 2}}'),
         ("/maps/room/current", '{"version": "1", "version": "1"}'),
-        ("/geopose", '{"id": "1", "id": "2"}'),
-        ("/geopose", '{"sensors": [{"id": "a", "id": "b"}]}'),
     ],
 )
 def test_a_field_twice_in_json_is_refused(path: str, text: str, doors: Any) -> None:
     headers = {"Content-Type": "application/json"}
-    if path == "/geopose":
-        headers["Accept"] = "application/vnd.oscp+json;version=2.0"
     response = doors.http.post(path, content=text, headers=headers)
 
     assert problem(response, 422, "request.duplicate_field")["field"] in text

@@ -84,8 +84,6 @@ def keys(tmp_path: Path) -> Keys:
         ("POST", "/localize", LOCALIZE),
         ("POST", "/localize/rig", LOCALIZE),
         ("POST", "/localize/sequence", LOCALIZE),
-        ("GET", "/geopose", LOCALIZE),
-        ("POST", "/geopose", LOCALIZE),
         ("GET", "/maps", READ),
         ("HEAD", "/maps", READ),
         ("GET", "/maps/room", READ),

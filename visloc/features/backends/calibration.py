@@ -2,8 +2,8 @@
 
 Those of known weights are recorded in ``visloc/features/weights/ranges``. For other weights they
 are measured once, on the pictures that lie there too, and kept in the user's cache folder. Nothing
-depends on the cache: without it they are measured again. ``python -m training ranges`` makes the
-records and the pictures.
+depends on the cache: without it they are measured again. The extension ``training`` makes the
+records and the pictures (its command ``ranges``).
 """
 
 from __future__ import annotations

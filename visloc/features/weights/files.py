@@ -2,8 +2,7 @@
 
 Published weights are neither shipped nor downloaded. They come with a package, or the operator
 downloads them and names the folder. Some, such as R2D2's, are for non-commercial use only. Our own
-weights of Fast-R2D2 (``training``, docs/models/fast-r2d2.md) are free to use and lie beside this
-module.
+weights of Fast-R2D2 (docs/models/fast-r2d2.md) are free to use and lie beside this module.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
 """R2D2 (Revaud et al., NeurIPS 2019) and Fast-R2D2 (Humenberger et al. 2020, appendix).
 
-Written from the papers and from the published weights' own shapes. Our own weights come from
-``training``. One trunk of nine convolutions gives 128 channels x per pixel; two 1 x 1 heads on x^2
-give reliability and repeatability; x / |x| is the descriptor. Fast-R2D2 pools once, so that most of
-the trunk works at half resolution, and interpolates x back to full resolution before the heads.
+Written from the papers and from the published weights' own shapes. Our own weights come from the
+extension ``training``. One trunk of nine convolutions gives 128 channels x per pixel; two 1 x 1
+heads on x^2 give reliability and repeatability; x / |x| is the descriptor. Fast-R2D2 pools once, so
+that most of the trunk works at half resolution, and interpolates x back to full resolution before
+the heads.
 """
 
 from __future__ import annotations

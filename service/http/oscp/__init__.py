@@ -1,1 +1,0 @@
-"""The OSCP GeoPose protocol."""

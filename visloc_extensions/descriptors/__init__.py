@@ -1,0 +1,1 @@
+"""Adds the global descriptors ``apgem``, ``delg`` and ``netvlad``; weights are the user's."""

@@ -1,0 +1,1 @@
+"""Adds ``GET`` and ``POST /geopose`` to the service: the OSCP GeoPose protocol."""

@@ -1,0 +1,1 @@
+"""Adds ``--executor ray``: builds on a Ray cluster."""
