@@ -33,9 +33,8 @@ from visloc.localization.query.feature_cache import FeatureCache
 from visloc.matching.correspondences import Correspondences, settled
 from visloc.options import LocalizeOptions
 from visloc.photos.reading import read_photo_file
-from visloc.pose.colmap import project
 from visloc.pose.generalized import refine_generalized_pose
-from visloc.pose.views import MatchedView
+from visloc.pose.reprojection import MatchedView, project
 from visloc.types import LocalFeatures, Localized
 
 WINDOW_PX = 6.0

@@ -23,9 +23,9 @@ from visloc.localization.acceptance.gates import registration_for
 from visloc.localization.localizer import Localizer
 from visloc.options import LocalizeOptions
 from visloc.photos.reading import read_photo_file
-from visloc.pose.centre import moved_origin
+from visloc.pose.covariance import moved_origin
 from visloc.pose.generalized import refine_generalized_pose
-from visloc.pose.views import MatchedView
+from visloc.pose.reprojection import MatchedView
 
 OPTIONS = LocalizeOptions()
 

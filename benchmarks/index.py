@@ -31,9 +31,8 @@ from numpy.typing import NDArray
 
 from benchmarks.generated_tiles import City
 from benchmarks.large_map_queries import anonymous_mb, percentiles_ms
-from visloc.retrieval.index import retrieve
+from visloc.retrieval.index import GlobalRows, in_8_bits, retrieve
 from visloc.retrieval.inverted import InvertedFile, bytes_of, make_centers, make_lists, num_lists
-from visloc.retrieval.rows import GlobalRows, in_8_bits
 
 Query = Mapping[str, NDArray[np.float32]]
 Index = Mapping[str, GlobalRows]

@@ -28,8 +28,7 @@ from visloc.kapture import read_dataset
 from visloc.localization.localizer import Localizer
 from visloc.matching import compiled
 from visloc.matching.compiled import NearestColumns
-from visloc.matching.nearest import nearest_by_torch
-from visloc.matching.products import EightBitRows
+from visloc.matching.products import EightBitRows, nearest_by_torch
 from visloc.options import LocalizeOptions
 from visloc.photos.reading import read_photo_file
 

@@ -35,8 +35,8 @@ from visloc.localization.acceptance.redraws import crowding, widening, with_redr
 from visloc.localization.localizer import Localizer
 from visloc.localization.map_view.constraints import Constraints
 from visloc.options import LocalizeOptions
-from visloc.pose.centre import moved_origin, position_covariance
-from visloc.pose.views import MatchedView
+from visloc.pose.covariance import moved_origin, position_covariance
+from visloc.pose.reprojection import MatchedView
 from visloc.priors import NO_PRIORS
 
 MAPS = (SAMPLE, "castle", "redkitchen", "kitti_curve", "gardenspoint")

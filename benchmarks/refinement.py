@@ -34,9 +34,8 @@ from visloc.options import LocalizeOptions
 from visloc.photos.reading import read_photo_file
 from visloc.pose.covariance import pose_covariance
 from visloc.pose.refinement import LOSS_SCALE_PX, RefinedPose, refine
-from visloc.pose.reprojection import reprojection_errors
+from visloc.pose.reprojection import MatchedView, reprojection_errors
 from visloc.pose.search import search_with_pycolmap
-from visloc.pose.views import MatchedView
 
 _MAX_ERROR_PX = 12.0  # of the default preset
 _SEEDS = range(5)

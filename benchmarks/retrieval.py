@@ -48,7 +48,7 @@ from visloc.localization.localizer import Localizer
 from visloc.localization.query.feature_cache import FeatureCache
 from visloc.options import LocalizeOptions
 from visloc.photos.reading import read_photo_file
-from visloc.pose.colmap import project
+from visloc.pose.reprojection import project
 from visloc.retrieval.fusion import FUSION_OPERATORS, LateFusion
 from visloc.retrieval.index import retrieve
 

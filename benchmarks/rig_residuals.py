@@ -17,8 +17,8 @@ import typer
 from benchmarks.refinement import matched_photos, of_rig
 from benchmarks.speed.tables import table
 from visloc.options import Solver
-from visloc.pose.colmap import project
 from visloc.pose.generalized import estimate_generalized_pose
+from visloc.pose.reprojection import project
 
 _MAX_ERROR_PX = 12.0  # of the default preset
 _NEAR_PX = 4.0  # landmarks farther off are wrong matches

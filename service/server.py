@@ -17,10 +17,9 @@ from service.descriptors import METRICS_CONNECTIONS
 from service.engine.engine import Engine
 from service.engine.stores import open_store
 from service.grpc.server import GrpcServer
-from service.http.acceptor import Acceptor, OpenConnections
+from service.http.acceptor import Acceptor, OpenConnections, Patient
 from service.http.app import create_app
 from service.http.backend import Backend
-from service.http.crowds import Patient
 from service.http.health import metrics_app
 from service.http.slow_clients import Arrivals, http_protocol
 from service.security.access import open_access

@@ -21,7 +21,7 @@ from visloc.errors import refuse
 from visloc.geometry import Camera, Pose
 from visloc.in_process import LocalMap, PhotoResult, require
 from visloc.photos.reading import read_photo_file
-from visloc.pose.colmap import project
+from visloc.pose.reprojection import project
 from visloc.types import Localized
 
 if TYPE_CHECKING:

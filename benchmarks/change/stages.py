@@ -20,10 +20,9 @@ from visloc.localization.map_view.constraints import Constraints
 from visloc.localization.query.feature_cache import FeatureCache
 from visloc.localization.solving import Look
 from visloc.options import LocalizeOptions
-from visloc.pose.centre import moved_origin, position_covariance
-from visloc.pose.colmap import project
+from visloc.pose.covariance import moved_origin, position_covariance
 from visloc.pose.generalized import GeneralizedPose, refine_generalized_pose
-from visloc.pose.views import MatchedView
+from visloc.pose.reprojection import MatchedView, project
 from visloc.priors import NO_PRIORS
 from visloc.retrieval.index import retrieve
 from visloc.types import Localized

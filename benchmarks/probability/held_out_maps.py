@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mapping.own_test.held_out import vanishing
 from visloc.archive import Map
-from visloc.retrieval.rows import GlobalRows
+from visloc.retrieval.index import GlobalRows
 
 
 def without(opened: Map, photos: NDArray[np.int64]) -> Map:

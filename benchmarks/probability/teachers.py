@@ -29,7 +29,7 @@ from visloc.localization.localizer import Localizer
 from visloc.localization.map_view.constraints import Constraints, MapGeometry
 from visloc.options import LocalizeOptions
 from visloc.photos.reading import Photo, read_photo_file
-from visloc.pose.views import MatchedView
+from visloc.pose.reprojection import MatchedView
 from visloc.priors import NO_PRIORS
 from visloc_extensions.report.look_alikes import shares_place
 

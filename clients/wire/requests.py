@@ -22,7 +22,7 @@ from visloc.geometry import Camera
 from visloc.priors import Priors
 from visloc.sequences.filling import TimeUnit, guess_time_unit
 from visloc.types import MaskedImage, Near, RigSensor
-from visloc_api.words import geometry, rigs, sequences
+from visloc_api.words import poses, rigs, sequences
 from visloc_api.words.options import LocalizeOptions
 from visloc_api.words.photo import LocalizeRequest
 from visloc_api.words.wire import REQUEST_ID
@@ -291,7 +291,7 @@ def _image(image: RigImage, field: str) -> rigs.RigImage:
 def _photo(query: PhotoOrFeatures, camera: Camera | None) -> dict[str, Any]:
     """Return the fields that say a photo or its features, and its camera."""
     content = read_query(query)
-    said = {"camera": None if camera is None else geometry.Camera.from_core(camera)}
+    said = {"camera": None if camera is None else poses.Camera.from_core(camera)}
     if isinstance(content, Features):
         return said | {"features": visloc_api.words.features.Features.from_core(content)}
     if isinstance(content, MaskedImage):

@@ -20,8 +20,8 @@ from visloc.evaluation import pose_error
 from visloc.geometry import Camera, Pose, Similarity
 from visloc.localization.acceptance.gates import registration_for
 from visloc.options import LocalizeOptions
-from visloc.pose.colmap import project
 from visloc.pose.refinement import LOSS_SCALE_PX
+from visloc.pose.reprojection import project
 
 MIN_PHOTOS = 3
 # How many pairs of photos propose a similarity.

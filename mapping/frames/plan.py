@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from visloc.archive import Map
 from visloc.geometry import Camera, Pose
-from visloc.localization.map_view.viewpoints import Viewpoints
+from visloc.localization.map_view.constraints import Viewpoints
 
 # A mean of directions shorter than this tells none.
 _LEAST_MEAN = 0.1

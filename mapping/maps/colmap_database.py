@@ -15,12 +15,12 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
-import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
+import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.reprojection
 import pycolmap
 from numpy.typing import NDArray
 
 from visloc.geometry import Camera, Pose, cross_matrix
-from visloc.pose.colmap import colmap_camera
+from visloc.pose.reprojection import colmap_camera
 
 _VERSION = 3800
 _SCHEMA = """

@@ -40,7 +40,7 @@ from visloc.kapture import (
     write_reconstruction,
 )
 from visloc.localization.localizer import Localizer
-from visloc.pose.colmap import colmap_camera
+from visloc.pose.reprojection import colmap_camera
 
 _NO_ERROR = -1.0  # COLMAP's word for a point whose error is not known
 _IMPORTED = "imported"  # type of the keypoints of the reconstruction that a map came from

@@ -30,7 +30,7 @@ from visloc.archive import Anchor, Landmarks
 from visloc.errors import refuse
 from visloc.geometry import Similarity
 from visloc.kapture import Dataset
-from visloc.pose.colmap import normalized_rays, project
+from visloc.pose.reprojection import normalized_rays, project
 
 # Raised when the code of the stage changes what comes out.
 _LIFTED_REVISION = 3

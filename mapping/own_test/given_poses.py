@@ -32,7 +32,7 @@ from visloc.kapture import Dataset
 from visloc.matching.correspondences import mutual_nearest_neighbours
 from visloc.matching.products import round_descriptors
 from visloc.matching.verification import epipolar_errors
-from visloc.pose.colmap import normalized_rays
+from visloc.pose.reprojection import normalized_rays
 from visloc.pose_conventions import READINGS
 
 STAGE = "given poses"

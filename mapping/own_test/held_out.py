@@ -21,12 +21,10 @@ from visloc.archive.schema import Doubt
 from visloc.evaluation import pose_error
 from visloc.geometry import Pose
 from visloc.localization.acceptance.gates import registration_for
-from visloc.localization.map_view.constraints import MapGeometry
-from visloc.localization.map_view.viewpoints import Viewpoints
+from visloc.localization.map_view.constraints import MapGeometry, Viewpoints
 from visloc.matching.correspondences import Correspondences
 from visloc.options import LocalizeOptions
-from visloc.pose.reprojection import reprojection_errors
-from visloc.pose.views import MatchedView
+from visloc.pose.reprojection import MatchedView, reprojection_errors
 from visloc.retrieval.index import retrieve
 
 # How far from the photo others are left out, as ``Viewpoints.apart_from`` counts: nothing but the

@@ -24,10 +24,9 @@ from visloc.archive import Map, open_map
 from visloc.archive.schema import MAX_FACTOR, MAX_WRONG_SCORES, OwnTest, Score
 from visloc.geometry import Pose, center_covariance
 from visloc.localization.acceptance.judge import TIE_ANGLE, TIE_REACH_SHARE
-from visloc.localization.map_view.constraints import MapGeometry
-from visloc.localization.map_view.viewpoints import Viewpoints
+from visloc.localization.map_view.constraints import MapGeometry, Viewpoints
 from visloc.options import LocalizeOptions
-from visloc.pose.map_errors import PHOTO_ONLY
+from visloc.pose.covariance import PHOTO_ONLY
 
 # How many photos are tried: a fifth of the map, within these limits. The test then takes a tenth of
 # the time of a build (docs/decisions/0028-the-maps-own-test.md).

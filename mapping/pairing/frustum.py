@@ -47,7 +47,7 @@ from mapping.pairing.scene import Pairs, Scene
 from mapping.pairing.settings import PairSettings
 from visloc.errors import refuse
 from visloc.geometry import Camera
-from visloc.pose.colmap import normalized_rays
+from visloc.pose.reprojection import normalized_rays
 
 MIN_OVERLAP = 0.1
 _MAX_RAY_ANGLE = math.radians(60.0)

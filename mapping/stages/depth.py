@@ -20,7 +20,7 @@ from PIL import Image
 from visloc.errors import VislocError, refuse
 from visloc.geometry import Camera, Pose, rotation_angle
 from visloc.kapture import Dataset, FileRecord
-from visloc.pose.colmap import normalized_rays, project
+from visloc.pose.reprojection import normalized_rays, project
 
 DEFAULT_DEPTH_SCALE = 0.001  # metres per unit of a 16-bit PNG: recorders write millimetres
 MAX_DEPTH_PIXELS = 16_000_000

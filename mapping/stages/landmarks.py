@@ -16,7 +16,7 @@ from mapping.stages.imported_points import ImportedPoints
 from visloc.archive import Anchor, Landmarks
 from visloc.archive.schema import Doubt
 from visloc.geometry import Camera, Pose
-from visloc.pose.colmap import project
+from visloc.pose.reprojection import project
 
 # Directions of this many observations are compared at a time: 100 MB.
 _MAX_DIRECTIONS = 4_000_000

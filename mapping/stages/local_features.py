@@ -28,7 +28,7 @@ from visloc.features.local.readymade import (
     ready_made_type,
     to_local_features,
 )
-from visloc.features.photo import extract_features
+from visloc.features.resolution import extract_features
 from visloc.geometry import PixelOrigin
 from visloc.kapture import FeatureSet, open_local_features, read_local
 from visloc.photos.reading import turn_of

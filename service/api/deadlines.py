@@ -1,16 +1,17 @@
-"""How long a request may take: what the caller asks for, within what the server allows."""
+"""The id of a request, and how long it may take: what the caller asks for, within what the server allows."""
 
 from __future__ import annotations
 
 import asyncio
 import math
+import uuid
 from collections.abc import AsyncGenerator, AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from typing import TypeVar
 
 from visloc.errors import refuse
-from visloc_api.words.wire import TIMEOUT_HEADER
+from visloc_api.words.wire import REQUEST_ID, TIMEOUT_HEADER
 
 T = TypeVar("T")
 
@@ -81,3 +82,8 @@ async def each_within(limit: TimeLimit, items: AsyncIterator[T]) -> AsyncGenerat
             except StopAsyncIteration:
                 return
         yield item
+
+
+def request_id(given: str | None) -> str:
+    """Return the caller's id when it is short and visible ASCII, else a new one."""
+    return given if given and REQUEST_ID.fullmatch(given) else uuid.uuid4().hex

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from service.engine.gather import together
+from service.engine.instant_tasks import together
 from visloc.archive import MapStore
 from visloc.errors import VislocError
 

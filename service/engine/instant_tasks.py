@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import asyncio
+from collections.abc import Coroutine, Iterable, Sequence
 from dataclasses import replace
 from time import time
+from typing import Any, TypeVar
 
-from service.engine.gather import together
 from service.values import ImageJob, Localization, MapFolder, PackedLooks, Rig, RigJob
 from service.workers.pool import Workers
 from service.workers.tasks import Vision
@@ -50,3 +51,21 @@ async def look(
 def without_photos(images: Sequence[ImageJob]) -> tuple[ImageJob, ...]:
     """Return images for checks that do not need their photos."""
     return tuple(replace(image, query=b"") for image in images)
+
+
+T = TypeVar("T")
+
+
+async def together(work: Iterable[Coroutine[Any, Any, T]]) -> list[T]:
+    """Run coroutines concurrently, and return their results in order.
+
+    Raises:
+        Exception: the first error; the other coroutines have been cancelled and have ended.
+    """
+    tasks = [asyncio.ensure_future(each) for each in work]
+    try:
+        return await asyncio.gather(*tasks)
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)

@@ -10,7 +10,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from service.engine.gather import together
+from service.engine.instant_tasks import together
 from service.values import MapFolder, PackedQuery, Query
 from service.workers.pool import Workers
 from service.workers.tasks import Vision

@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.engine.catalog import Catalog
-from service.engine.gather import together
-from service.engine.instant_tasks import localize_in
+from service.engine.instant_tasks import localize_in, together
 from service.engine.set_photos import SetPhotos, Slots
 from service.telemetry.metrics import Metrics
 from service.values import ImageJob, Localization, MapFolder, Query, Rig, RigJob, Where

@@ -14,7 +14,7 @@ from google.rpc.status_pb2 import Status
 from pydantic import BaseModel
 
 import visloc
-from service.api.request_ids import request_id
+from service.api.deadlines import request_id
 from service.errors import internal_error, statuses_of
 from service.telemetry.logs import RequestRecord
 from service.telemetry.observer import Observer

@@ -7,9 +7,8 @@ from collections.abc import AsyncGenerator, AsyncIterator
 from contextlib import aclosing
 
 from service.api.answers import instant_answer, localize_response
-from service.api.deadlines import TimeLimit, within
+from service.api.deadlines import TimeLimit, request_id, within
 from service.api.maps import map_info
-from service.api.request_ids import request_id
 from service.engine.engine import Engine
 from service.grpc.envelope import Context, Envelope, message_of
 from service.grpc.messages import (

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import AsyncGenerator, AsyncIterator
 from contextlib import aclosing
 
+from service.api.deadlines import request_id
 from service.api.maps import map_info
-from service.api.request_ids import request_id
 from service.engine.engine import Engine
 from service.grpc.envelope import Context, Envelope, message_of
 from service.telemetry.observer import Observer

@@ -10,7 +10,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.api.request_ids import request_id
+from service.api.deadlines import request_id
 from service.errors import internal_error, stopping_error
 from service.http.backend import Backend
 from service.http.responses import problem_response

@@ -60,7 +60,7 @@ class Observer:
 
         Args:
             door: ``http`` or ``grpc``.
-            request_id: as ``service.api.request_ids`` returned it.
+            request_id: as ``service.api.deadlines`` returned it.
             route: the method and the template of the path, or the name of the gRPC method.
             traceparent: the caller's header, unchecked.
         """

@@ -22,7 +22,7 @@ from benchmarks.retrieval import (
 from visloc.archive.schema import Parts
 from visloc.geometry import Camera, Pose
 from visloc.retrieval.fusion import EQUAL_GHARM
-from visloc.retrieval.rows import GlobalRows
+from visloc.retrieval.index import GlobalRows
 
 CAMERA = Camera("SIMPLE_PINHOLE", 640, 480, (500.0, 320.0, 240.0))
 HERE = Pose.identity()

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from service.api.request_ids import request_id
+from service.api.deadlines import request_id
 from service.errors import STATUSES, statuses_of
 from visloc.errors import Overloaded, TooLarge, VislocError
 

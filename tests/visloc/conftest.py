@@ -71,7 +71,7 @@ class Place:
     ) -> Matches:
         """Correspondences of one image, the right ones first."""
         from visloc.localization.solving import Matches
-        from visloc.pose.colmap import normalized_rays
+        from visloc.pose.reprojection import normalized_rays
 
         rng = np.random.default_rng(seed)
         pixels = rng.uniform([5, 5], [635, 475], (right + wrong, 2))

@@ -39,7 +39,7 @@ from visloc.archive.set_schema import SetManifest
 from visloc.errors import InvalidInput, refuse
 from visloc.geometry import Camera, Pose
 from visloc.retrieval.fusion import LateFusion
-from visloc.retrieval.rows import GlobalRows
+from visloc.retrieval.index import GlobalRows
 
 Model = Mapping[str, NDArray[np.float32]]
 logger = logging.getLogger(__name__)

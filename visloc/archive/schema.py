@@ -261,7 +261,7 @@ class OwnTest(Record):
         localized: of these, those that got a pose.
         wrong: of these, those at another place than the photo.
         position_factor: by how much poses are further off than the scatter of their photos tells;
-            ``visloc.pose.map_errors.MapErrors``.
+            ``visloc.pose.covariance.MapErrors``.
         orientation_factor: likewise.
         independent: whether the photos' own poses came from elsewhere than the map's landmarks.
         wrong_at: the scores of wrong poses, the most convincing first.

@@ -24,9 +24,8 @@ from visloc.archive.schema import (
     RetrievalRecord,
 )
 from visloc.geometry import Camera, Pose
-from visloc.retrieval.index import MAX_EXACT, IndexKind
+from visloc.retrieval.index import MAX_EXACT, IndexKind, in_8_bits
 from visloc.retrieval.inverted import Rows, bytes_of, make_centers, make_lists, num_lists
-from visloc.retrieval.rows import in_8_bits
 
 # Keypoints are stored as 16-bit multiples of a power of two, with an image at most so many steps
 # wide, which leaves room beyond its edges. Where that is too coarse or too narrow: as float32.

@@ -56,9 +56,8 @@ from visloc.matching.products import round_descriptors, start_threads
 from visloc.options import Fallback, LocalizeOptions, Matcher, ReadAs
 from visloc.photos.reading import Photo
 from visloc.priors import NO_PRIORS, Priors
-from visloc.retrieval.excluded import excluded_photos
 from visloc.retrieval.fusion import LateFusion, chosen_fusion
-from visloc.retrieval.index import Retrieved, compare, retrieve
+from visloc.retrieval.index import Retrieved, compare, excluded_photos, retrieve
 from visloc.runtime.timing import timed
 from visloc.types import (
     Answer,

@@ -28,8 +28,8 @@ from visloc.localization.map_view.constraints import Constraints, MapGeometry
 from visloc.localization.solving import Look, Matches, SeenImage, Solved, solve_instant
 from visloc.options import DEFAULT_PRESET, PRESETS, LocalizeOptions
 from visloc.pose.generalized import GeneralizedPose, refine_generalized_pose
+from visloc.pose.reprojection import MatchedView
 from visloc.pose.search import search_with_pycolmap
-from visloc.pose.views import MatchedView
 from visloc.priors import Priors
 from visloc.types import CameraSource, Reason
 

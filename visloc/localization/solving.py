@@ -25,9 +25,9 @@ from visloc.localization.map_view.constraints import Constraints, MapGeometry
 from visloc.localization.query.camera import guessed_camera
 from visloc.localization.turning import REASONS_OF_TURNED_PHOTOS
 from visloc.options import LocalizeOptions, ReadAs, Solver
-from visloc.pose.centre import position_covariance, with_origin
+from visloc.pose.covariance import position_covariance, with_origin
 from visloc.pose.generalized import GeneralizedPose
-from visloc.pose.views import MatchedView
+from visloc.pose.reprojection import MatchedView
 from visloc.priors import Priors
 from visloc.runtime.timing import summed, timed
 from visloc.types import (

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.matching.nearest import Nearest, nearest
 from visloc.matching.on_device import nearest_on
-from visloc.matching.products import EightBitRows, in_threads
+from visloc.matching.products import EightBitRows, Nearest, in_threads, nearest
 from visloc.runtime.device import has_cuda, torch_device
 
 if TYPE_CHECKING:

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.matching.nearest import Nearest
-from visloc.matching.products import LARGEST_PRODUCT, exact_float
+from visloc.matching.products import LARGEST_PRODUCT, Nearest, exact_float
 
 if TYPE_CHECKING:
     import torch

@@ -14,7 +14,7 @@ photo says nothing stays as it is known.
 
 Landmarks share errors, which no number of matches averages out. So matches count less, as the map's
 own test found poses to be further off than the scatter of matches tells
-(``visloc.pose.map_errors``), and as matches near each other err alike.
+(``visloc.pose.covariance``), and as matches near each other err alike.
 """
 
 from __future__ import annotations
@@ -27,11 +27,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.geometry import CAMERA_MODELS, Camera, Pose
-from visloc.pose.colmap import project
 from visloc.pose.motion import UncertainPose, moved
 from visloc.pose.refinement import LOSS_SCALE_PX
-from visloc.pose.reprojection import has_derivative, linearized, reprojection_errors
-from visloc.pose.views import MatchedView
+from visloc.pose.reprojection import (
+    MatchedView,
+    has_derivative,
+    linearized,
+    project,
+    reprojection_errors,
+)
 from visloc.types import CameraSource
 
 FOCAL, SHIFT_X, SHIFT_Y, RADIAL = range(4)

@@ -19,12 +19,12 @@ from visloc.pose.covariance import pose_covariance
 from visloc.pose.gravity import KnownGravity, find_upright_poses
 from visloc.pose.refinement import LOSS_SCALE_PX, RefinedPose, refine
 from visloc.pose.registration import REGISTRATION_LOSS_SCALE_PX, register
+from visloc.pose.reprojection import MatchedView
 from visloc.pose.search import (
     search_with_focal_length,
     search_with_poselib,
     search_with_pycolmap,
 )
-from visloc.pose.views import MatchedView
 
 # Focal lengths in units of the longer side, from 136 degrees across to 6: all usual lenses. Poses
 # with others explain wrong matches, such as those in a spot or in a flat picture.

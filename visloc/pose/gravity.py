@@ -15,8 +15,7 @@ import poselib
 from numpy.typing import NDArray
 
 from visloc.geometry import Pose
-from visloc.pose.colmap import normalized_rays
-from visloc.pose.views import MatchedView
+from visloc.pose.reprojection import MatchedView, normalized_rays
 
 _SAMPLE_SIZE = 2
 # At 5 % inliers one sample is right with the stated confidence.

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from visloc.geometry import Pose
 from visloc.pose.motion import moved
 from visloc.pose.refinement import LOSS_SCALE_PX
-from visloc.pose.reprojection import has_derivative, linearized, reprojection_errors
-from visloc.pose.views import MatchedView
+from visloc.pose.reprojection import MatchedView, has_derivative, linearized, reprojection_errors
 
 # Places in a change of the intrinsics.
 FOCAL, SHIFT_X, SHIFT_Y, ASPECT = range(4)

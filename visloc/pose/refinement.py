@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from visloc.geometry import Pose
 from visloc.pose.motion import moved
-from visloc.pose.reprojection import has_derivative, linearized, reprojection_errors
-from visloc.pose.views import MatchedView
+from visloc.pose.reprojection import MatchedView, has_derivative, linearized, reprojection_errors
 
 # Scale of the Cauchy loss. Landmarks from depth maps scatter by a few pixels.
 LOSS_SCALE_PX = 3.0

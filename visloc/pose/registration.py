@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
+import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.reprojection
 import pycolmap
 from numpy.typing import NDArray
 
 from visloc.geometry import Pose
-from visloc.pose.colmap import colmap_camera, pose_from_colmap
 from visloc.pose.refinement import MIN_INLIERS
-from visloc.pose.views import MatchedView
+from visloc.pose.reprojection import MatchedView, colmap_camera, pose_from_colmap
 
 # COLMAP's own, for poses.
 REGISTRATION_LOSS_SCALE_PX = 1.0

@@ -1,15 +1,20 @@
-"""Where points of the map fall in the images, and how that changes with the rig's pose."""
+"""Where points of the map fall in the images, and how that changes with the rig's pose.
+
+What a camera makes of points and pixels is asked of pycolmap, so that all of its models are known.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
+import PIL.Image  # noqa: F401  Pillow saves PNGs only when it was imported before pycolmap
+import pycolmap
 from numpy.typing import NDArray
 
-from visloc.geometry import Camera, Pose
-from visloc.pose.colmap import project
-from visloc.pose.views import MatchedView
+from visloc.geometry import CAMERA_MODELS, Camera, Pose
 
 # No derivative of a point that a camera sees well is nearly as large, and its square is a number.
 _MAX_DERIVATIVE = 1e100
@@ -108,3 +113,90 @@ def _pinhole_derivatives(camera: Camera, in_cam: NDArray[np.float64]) -> NDArray
         by_point[2, 0] = -by_point[0, 0] * (x / z)
         by_point[2, 1] = -by_point[1, 1] * (y / z)
     return by_point
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MatchedView:
+    """One camera of a rig and its 2D-3D correspondences; there may be none.
+
+    Attributes:
+        camera: intrinsics.
+        cam_from_rig: where it sits; the identity for a camera on its own.
+        pixels: (n, 2) float64 in the camera's image; those matched best come first, where that is
+            known.
+        points: (n, 3) float64 in a world frame whose numbers are not large.
+        focal_unknown: the camera's focal length is a guess to be found together with the pose, or
+            was found so.
+    """
+
+    camera: Camera
+    cam_from_rig: Pose
+    pixels: NDArray[np.float64]
+    points: NDArray[np.float64]
+    focal_unknown: bool = False
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    def selected(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> MatchedView:
+        """Keep some of the correspondences, by mask or by rows."""
+        return replace(self, pixels=self.pixels[which], points=self.points[which])
+
+    @property
+    def principal_point(self) -> NDArray[np.float64]:
+        """Where the camera looks, (2,) in pixels."""
+        params = dict(zip(CAMERA_MODELS[self.camera.model], self.camera.params, strict=True))
+        return np.array([params["cx"], params["cy"]])
+
+    def zoomed(self, factor: float) -> MatchedView:
+        """Take the correspondences for those of a camera with so many times the focal length."""
+        camera = self.camera
+        params = tuple(
+            value * factor if name in ("f", "fx", "fy") else value
+            for name, value in zip(CAMERA_MODELS[camera.model], camera.params, strict=True)
+        )
+        return replace(self, camera=replace(camera, params=params))
+
+
+_COMES_BACK_PX = 1.0  # far above what undistortion leaves, far below what is seen beyond 90 degrees
+
+
+def colmap_camera(camera: Camera) -> pycolmap.Camera:
+    """Return the same camera for pycolmap. Pixel conventions are the same."""
+    return pycolmap.Camera(
+        model=camera.model, width=camera.width, height=camera.height, params=list(camera.params)
+    )
+
+
+@lru_cache(maxsize=64)
+def _kept_camera(camera: Camera) -> pycolmap.Camera:
+    """Return the same as ``colmap_camera``, to be read only; a query asks dozens of times."""
+    return colmap_camera(camera)
+
+
+def pose_from_colmap(rigid: pycolmap.Rigid3d) -> Pose:
+    """Return pycolmap's transform as ours, with a rotation that is a copy, not a view."""
+    matrix = np.array(rigid.matrix(), dtype=np.float64)
+    return Pose(matrix[:, :3], matrix[:, 3])
+
+
+def normalized_rays(camera: Camera, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return the points (N, 3) at depth 1 that pixels (N, 2) see, in the camera's frame.
+
+    A pixel whose undistortion does not converge, or that sees what is beside or behind the camera,
+    gives NaN.
+    """
+    if len(pixels) == 0:
+        return np.empty((0, 3))
+    plane = np.asarray(_kept_camera(camera).cam_from_img(np.asarray(pixels, dtype=np.float64)))
+    rays = np.column_stack([plane, np.ones(len(plane))])
+    # pycolmap has points in front of wide cameras for what lies beside them, too.
+    rays[~(np.abs(project(camera, rays) - pixels).max(axis=1) < _COMES_BACK_PX)] = np.nan
+    return rays
+
+
+def project(camera: Camera, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Project points (N, 3) in the camera's frame to pixels (N, 2); NaN behind the camera."""
+    if len(points) == 0:
+        return np.empty((0, 2))
+    return np.asarray(_kept_camera(camera).img_from_cam(points))

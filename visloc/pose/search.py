@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
+import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.reprojection
 import poselib
 import pycolmap
 from scipy.spatial.transform import Rotation
 
 from visloc.geometry import Camera, Pose
-from visloc.pose.colmap import colmap_camera, normalized_rays, pose_from_colmap
 from visloc.pose.refinement import MIN_INLIERS
-from visloc.pose.views import MatchedView
+from visloc.pose.reprojection import MatchedView, colmap_camera, normalized_rays, pose_from_colmap
 
 # Beyond this many trials a pose with 8 % inliers has been found with 99 % probability; a photo
 # of another place should not cost seconds.

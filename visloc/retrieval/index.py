@@ -1,4 +1,4 @@
-"""Ranks the mapping photos by similarity to the query."""
+"""Ranks the mapping photos by similarity to the query, and those to compare with."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.retrieval.fusion import EQUAL_GHARM, LateFusion
-from visloc.retrieval.inverted import InvertedFile, largest
-from visloc.retrieval.rows import GlobalRows
+from visloc.retrieval.inverted import InvertedFile, dot_products, largest
 
 # Maps with more photos get an inverted file, unless a build asks for something else.
 MAX_EXACT = 10_000
@@ -217,3 +216,103 @@ def _cosines(
     photos: NDArray[np.int64] | None,
 ) -> dict[str, NDArray[np.float64]]:
     return {name: rows.cosines(query[name], photos) for name, rows in index.items()}
+
+
+# Excluded photos among this many most similar ones are matched too: they may show that the priors
+# are wrong.
+_NUM_PHOTOS = 5
+
+
+def excluded_photos(
+    query: Mapping[str, NDArray[np.float32]],
+    index: Mapping[str, GlobalRows],
+    retrieved: Retrieved,
+    photo_weights: NDArray[np.float64] | None,
+    fusion: LateFusion,
+) -> NDArray[np.int64]:
+    """Return photos (k,) that the priors exclude and that look as much like the query as others.
+
+    On look-alike floors the most similar photo is a coin toss, so a photo need not be the very
+    best to count.
+
+    Args:
+        query: as for ``retrieve``.
+        index: as for ``retrieve``.
+        retrieved: the best photos that the priors allow.
+        photo_weights: of the priors, 0 for excluded photos; None when there are no priors.
+        fusion: as for ``retrieve``.
+    """
+    if photo_weights is None:
+        return np.empty(0, dtype=np.int64)
+    # Ranked among all photos: of the excluded ones alone, often none looks like the query, which
+    # takes longest to find out. Besides a photo that counts, at most four allowed and four excluded
+    # ones are as good.
+    everywhere = retrieve(query, index, 2 * _NUM_PHOTOS - 1, fusion=fusion)
+    among = np.flatnonzero(photo_weights[everywhere.images] == 0)[:_NUM_PHOTOS]
+    if len(among) < _NUM_PHOTOS and _are_better(everywhere, retrieved, fusion).all():
+        # More allowed photos than four are as good: they are not in ``retrieved``, because they
+        # count little, or because the caller chose others.
+        excluded = np.asarray(photo_weights == 0, dtype=np.float64)
+        everywhere = retrieve(query, index, _NUM_PHOTOS, excluded, fusion)
+        among = np.arange(len(everywhere.images))
+    others = Retrieved(
+        everywhere.images[among],
+        everywhere.scores[among],
+        {name: row[among] for name, row in everywhere.similarities.items()},
+    )
+    return np.asarray(others.images[_are_better(others, retrieved, fusion)])
+
+
+def _are_better(found: Retrieved, retrieved: Retrieved, fusion: LateFusion) -> NDArray[np.bool_]:
+    """Return which of the photos that were found (k,) are better than the fifth retrieved."""
+    # Fuse both lists together: scores that are ranks only compare within one ranking.
+    both, num = (retrieved.similarities, found.similarities), len(retrieved.images)
+    scores = fusion.scores({name: np.concatenate([f[name] for f in both]) for name in both[0]})
+    best = np.sort(scores[:num])[::-1][:_NUM_PHOTOS]
+    return np.asarray(scores[num:] > best.min(initial=np.inf))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GlobalRows:
+    """Unit rows (n, D), one per photo; ``rows[i]`` reads some as float32.
+
+    Attributes:
+        values: (n, D) int8 or float32.
+        scales: (n,) float32 factors of the rows of ``values``; None for 1.
+        inverted: None in maps whose rows are all compared with every query.
+    """
+
+    values: NDArray[np.int8] | NDArray[np.float32]
+    scales: NDArray[np.float32] | None = None
+    inverted: InvertedFile | None = None
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def __getitem__(self, rows: int | slice | NDArray[np.integer]) -> NDArray[np.float32]:
+        values = self.values[rows].astype(np.float32)
+        if self.scales is not None:
+            values *= np.asarray(self.scales[rows])[..., None]
+        return values
+
+    def cosines(
+        self, query: NDArray[np.float32], photos: NDArray[np.int64] | None = None
+    ) -> NDArray[np.float64]:
+        """Return the cosines (m,) of a unit vector (D,) with some rows (m,), or all."""
+        found = dot_products(self.values, query, photos)
+        if self.scales is not None:
+            found *= self.scales if photos is None else self.scales[photos]
+        # Unit vectors in float32 can give 1 + 1e-7.
+        return np.clip(found.astype(np.float64), -1.0, 1.0)
+
+
+def in_8_bits(rows: NDArray[np.float32]) -> tuple[NDArray[np.int8], NDArray[np.float32]]:
+    """Round unit rows (n, D) to int8; return them with scales (n,) that restore unit length.
+
+    The zero rows of blank photos stay zero.
+    """
+    largest = np.abs(rows).max(axis=1, initial=0.0)
+    steps = np.where(largest > 0, largest, 1) / np.float32(127)
+    values = np.rint(rows / steps[:, None]).astype(np.int8)
+    lengths = np.linalg.norm(values.astype(np.float32), axis=1)
+    return values, np.where(lengths > 0, 1 / np.maximum(lengths, 1), 0).astype(np.float32)

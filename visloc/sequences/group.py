@@ -13,7 +13,7 @@ from visloc.geometry import Pose
 from visloc.options import RegistrationPreset
 from visloc.pose.generalized import estimate_generalized_pose
 from visloc.pose.motion import UncertainPose, chain
-from visloc.pose.views import MatchedView
+from visloc.pose.reprojection import MatchedView
 
 # Instants belong to one camera while drift, at one standard deviation, shifts pixels by less than
 # the largest error of an inlier.

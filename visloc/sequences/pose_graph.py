@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from visloc.geometry import Pose
 from visloc.pose.motion import UncertainPose, adjoint, difference, moved
-from visloc.pose.reprojection import has_derivative, linearized
-from visloc.pose.views import MatchedView
+from visloc.pose.reprojection import MatchedView, has_derivative, linearized
 
 _MAX_STEPS = 30
 # In units of chi-square: less moves nothing by a hundredth of its standard deviation.

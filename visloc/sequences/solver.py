@@ -30,7 +30,7 @@ from visloc.localization.solving import (
     with_inliers,
 )
 from visloc.options import LEAST_PROBABILITY, LocalizeOptions
-from visloc.pose.centre import with_origin
+from visloc.pose.covariance import with_origin
 from visloc.pose.motion import RelativeMotion, UncertainPose, link_from_motion
 from visloc.priors import Priors
 from visloc.runtime.timing import timed

@@ -18,16 +18,15 @@ from numpy.typing import NDArray
 
 from visloc.geometry import Pose
 from visloc.options import RegistrationPreset
+from visloc.pose.covariance import PHOTO_ONLY, MapErrors
 from visloc.pose.generalized import GeneralizedPose, refine_generalized_pose
-from visloc.pose.map_errors import PHOTO_ONLY, MapErrors
 from visloc.pose.motion import (
     RelativeMotion,
     UncertainPose,
     link_from_motion,
 )
 from visloc.pose.refinement import LOSS_SCALE_PX
-from visloc.pose.reprojection import reprojection_errors
-from visloc.pose.views import MatchedView
+from visloc.pose.reprojection import MatchedView, reprojection_errors
 from visloc.sequences.agreement import agreeing_pieces
 from visloc.sequences.group import carried, find_groups
 from visloc.sequences.pose_graph import Chain, error_scale, solve_chain

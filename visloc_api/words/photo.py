@@ -10,10 +10,10 @@ from pydantic import FailFast, Field
 from visloc.errors import refuse
 from visloc.options import MAX_MAPS
 from visloc_api.words.features import GivenFeatures, GivenImage, GivenMask
-from visloc_api.words.geometry import GivenCamera
 from visloc_api.words.message import IncomingMessage, converted
 from visloc_api.words.near import GivenNear
 from visloc_api.words.options import GivenOptions, LocalizeOptions
+from visloc_api.words.poses import GivenCamera
 from visloc_api.words.priors import GivenPriors
 
 PhotoField = Annotated[

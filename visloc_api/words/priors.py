@@ -11,8 +11,8 @@ from pydantic import FailFast, Field
 import visloc.priors
 from visloc.errors import refuse
 from visloc.priors import MAX_TILES
-from visloc_api.words.geometry import Numbers, Transform, covariance_to_core
 from visloc_api.words.message import IncomingMessage, converted
+from visloc_api.words.poses import Numbers, Transform, covariance_to_core
 
 _GRAVITY_STD_DEG = 1.0
 

@@ -10,11 +10,11 @@ from pydantic import BeforeValidator, FailFast, Field
 
 import visloc.types
 from visloc.errors import inside, refuse
-from visloc_api.words.geometry import Camera, GivenCamera, Transform
 from visloc_api.words.message import IncomingMessage, converted, counted
 from visloc_api.words.near import GivenNear
 from visloc_api.words.options import GivenOptions, LocalizeOptions
 from visloc_api.words.photo import FeaturesField, GivenMaps, GivenYpr, MaskField, PhotoField
+from visloc_api.words.poses import Camera, GivenCamera, Transform
 from visloc_api.words.priors import GivenPriors
 
 # More than any rig has: it bounds what a request can make the server look at.

@@ -8,11 +8,11 @@ from pydantic import FailFast, Field
 
 import visloc.sequences.filling
 from visloc.errors import refuse
-from visloc_api.words.geometry import Numbers, Transform, covariance_from_core, covariance_to_core
 from visloc_api.words.message import IncomingMessage, converted
 from visloc_api.words.near import GivenNear
 from visloc_api.words.options import GivenOptions, LocalizeOptions
 from visloc_api.words.photo import GivenMaps, GivenYpr
+from visloc_api.words.poses import Numbers, Transform, covariance_from_core, covariance_to_core
 from visloc_api.words.priors import GivenPriors
 from visloc_api.words.rigs import GivenRig, Images, Timestamp, at_most
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mapping.progress import ItemProgress
 from mapping.stages.landmarks import View
 from mapping.stages.photos import MappingPhoto
-from visloc.pose.colmap import normalized_rays, project
+from visloc.pose.reprojection import normalized_rays, project
 
 # Each holds its smaller sisters. AprilTag 16h5 is left out: every tenth window frame is one.
 _DICTIONARIES = (

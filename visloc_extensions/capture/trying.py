@@ -15,7 +15,7 @@ from visloc.archive import Map, MapStore
 from visloc.archive.schema import Doubt
 from visloc.errors import MapCorrupt, NotFound
 from visloc.geometry import Pose
-from visloc.pose.colmap import project
+from visloc.pose.reprojection import project
 from visloc_extensions.capture.frames import FilmedVideo
 
 LOST_SIZE = "size"

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mapping.importers.model import ImportedImage, ImportedModel
 from visloc.errors import refuse
 from visloc.kapture import Sensor
-from visloc.pose.colmap import project
+from visloc.pose.reprojection import project
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,8 +18,7 @@ from mapping.stages.work_folder import WorkFolder
 from visloc import __version__
 from visloc.archive import Map
 from visloc.geometry import Camera
-from visloc.localization.map_view.constraints import MapGeometry
-from visloc.localization.map_view.viewpoints import Viewpoints
+from visloc.localization.map_view.constraints import MapGeometry, Viewpoints
 from visloc_extensions.report.grid import Grid, forecast_grid, make_grid
 from visloc_extensions.report.held_out import hold_out
 from visloc_extensions.report.look_alikes import LookAlike, find_look_alikes

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mapping.frames.plan import Plan
-from visloc.localization.map_view.viewpoints import Viewpoints
+from visloc.localization.map_view.constraints import Viewpoints
 from visloc_extensions.report.model import CoverageModel, Forecast
 
 NUM_DIRECTIONS = 12

@@ -20,8 +20,7 @@ from mapping.own_test.held_out import (
 from mapping.stages.work_folder import Item, WorkFolder, key_of
 from visloc import __version__
 from visloc.archive import Map, open_map
-from visloc.localization.map_view.constraints import MapGeometry
-from visloc.localization.map_view.viewpoints import Viewpoints
+from visloc.localization.map_view.constraints import MapGeometry, Viewpoints
 from visloc.options import LocalizeOptions
 
 _REVISION = 1

@@ -20,8 +20,7 @@ from mapping.own_test.held_out import HeldOut, match_held_out
 from mapping.stages.work_folder import Item, WorkFolder, key_of
 from visloc import __version__
 from visloc.archive import Map
-from visloc.localization.map_view.constraints import MapGeometry
-from visloc.localization.map_view.viewpoints import Viewpoints
+from visloc.localization.map_view.constraints import MapGeometry, Viewpoints
 from visloc.options import LocalizeOptions
 from visloc_extensions.report.held_out import ask_photos, opened_once
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mapping.own_test.held_out import HeldOut, Within, too_seldom_seen
 from visloc.archive import Map
 from visloc.geometry import Camera, Pose
-from visloc.localization.map_view.viewpoints import Viewpoints
+from visloc.localization.map_view.constraints import Viewpoints
 from visloc_extensions.report.chance import (
     Chance,
     Outlook,

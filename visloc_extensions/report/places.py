@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.archive import Map
-from visloc.localization.map_view.viewpoints import Viewpoints
+from visloc.localization.map_view.constraints import Viewpoints
 
 # Side of a cell, of the distance from which photos see: at it, half a degree, some pixels.
 _CELL_OF_REACH = 0.01

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.geometry import Camera, Pose
-from visloc.localization.map_view.viewpoints import Viewpoints
+from visloc.localization.map_view.constraints import Viewpoints
 from visloc.options import LocalizeOptions
-from visloc.pose.colmap import normalized_rays, project
+from visloc.pose.reprojection import normalized_rays, project
 from visloc_extensions.report.places import Places
 
 # As many as a query is matched with. Those nearest in pose stand for those most alike.

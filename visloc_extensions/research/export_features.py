@@ -20,8 +20,7 @@ from visloc.features import (
     make_local_features,
 )
 from visloc.features.framing import Framing
-from visloc.features.photo import extract_features
-from visloc.features.resolution import Resolution, WorkingResolution
+from visloc.features.resolution import Resolution, WorkingResolution, extract_features
 from visloc.kapture import (
     Dataset,
     FileRecord,

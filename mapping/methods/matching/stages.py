@@ -29,7 +29,7 @@ from visloc.kapture.matches import MatchFiles, match_file
 from visloc.matching.correspondences import mutual_nearest_neighbours
 from visloc.matching.products import round_descriptors
 from visloc.matching.verification import epipolar_errors
-from visloc.pose.colmap import normalized_rays
+from visloc.pose.reprojection import normalized_rays
 
 # Raised when the code of a stage here changes what comes out.
 _REVISION = {"matches": 2, "fixed_things": 2, "verified": 5}

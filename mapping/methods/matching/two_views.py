@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from visloc.geometry import Camera, Pose
 from visloc.matching.verification import epipolar_errors
-from visloc.pose.colmap import normalized_rays
+from visloc.pose.reprojection import normalized_rays
 
 # Inliers are believed when chance gives so many at most once in 10^10 pairs with as many matches.
 MAX_LOG10_CHANCE = -10.0

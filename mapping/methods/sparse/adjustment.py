@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
-import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
+import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.reprojection
 import pycolmap
 from numpy.typing import NDArray
 
@@ -18,7 +18,7 @@ from mapping.methods.sparse.colmap_scene import ColmapScene
 from mapping.methods.sparse.intrinsics import STEP
 from mapping.methods.sparse.model import SfmPhoto
 from mapping.progress import ItemProgress, not_told, part_of
-from visloc.pose.colmap import pose_from_colmap
+from visloc.pose.reprojection import pose_from_colmap
 
 REFINABLE = ("poses", "points", "intrinsics")
 # Fewer photos of a camera do not tell its principal point; in lenses it lies nearer to the middle

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
+import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.reprojection
 import pycolmap
 
 from mapping.methods.matching.stages import Matches
@@ -19,7 +19,7 @@ from mapping.progress import ItemProgress, not_told
 from mapping.stages.landmarks import Observations, View, rows_by_value
 from visloc.errors import refuse
 from visloc.geometry import Camera, Pose
-from visloc.pose.colmap import colmap_camera, pose_from_colmap
+from visloc.pose.reprojection import colmap_camera, pose_from_colmap
 
 Rigs = Mapping[str, Mapping[str, Pose]]
 """cam_from_rig by rig and sensor."""

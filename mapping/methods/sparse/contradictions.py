@@ -27,8 +27,8 @@ from scipy.spatial import KDTree
 
 from mapping.progress import ItemProgress, not_told
 from mapping.stages.landmarks import View
-from visloc.pose.colmap import project
 from visloc.pose.distance import viewpoints_apart
+from visloc.pose.reprojection import project
 
 # Photos near one, by ``viewpoints_apart`` (radians). What they observe it should show, and it is
 # compared with them.

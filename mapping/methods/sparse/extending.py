@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
+import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.reprojection
 import pycolmap
 from numpy.typing import NDArray
 
@@ -20,7 +20,7 @@ from mapping.methods.sparse.points import cache_options
 from mapping.methods.sparse.triangulation import pipeline_options
 from mapping.progress import ItemProgress
 from mapping.stages.landmarks import Observations
-from visloc.pose.colmap import pose_from_colmap
+from visloc.pose.reprojection import pose_from_colmap
 
 # Adjusted poses let more matches fit, and these move the poses a little.
 _ROUNDS = 3

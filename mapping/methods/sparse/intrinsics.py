@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
+import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.reprojection
 import pycolmap
 from pydantic import BaseModel, ConfigDict
 

@@ -23,9 +23,8 @@ from mapping.methods.sparse.model import MapperConfig, SfmPhoto, SparseModel
 from mapping.progress import ItemProgress
 from mapping.stages.landmarks import View
 from visloc.geometry import Camera, Pose
-from visloc.pose.colmap import normalized_rays, project
 from visloc.pose.generalized import GeneralizedPose, estimate_generalized_pose
-from visloc.pose.views import MatchedView
+from visloc.pose.reprojection import MatchedView, normalized_rays, project
 
 # Matches with photos at most so many steps away in time are tried alone first, because repeated
 # things also match photos of other parts of the place.

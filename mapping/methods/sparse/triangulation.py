@@ -10,7 +10,7 @@ from itertools import count
 from pathlib import Path
 
 import numpy as np
-import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
+import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.reprojection
 import pycolmap
 
 from mapping.methods.matching.stages import Matches, matches_among

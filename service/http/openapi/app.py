@@ -10,9 +10,9 @@ from fastapi.responses import JSONResponse
 from pydantic.json_schema import models_json_schema
 
 from service.http.openapi import example
-from visloc_api.words.geometry import Camera
 from visloc_api.words.maps import UseVersionRequest
 from visloc_api.words.photo import LocalizeRequest
+from visloc_api.words.poses import Camera
 from visloc_api.words.rigs import LocalizeRigRequest, RigCalibration
 from visloc_api.words.sequences import LocalizeSequenceRequest
 from visloc_api.words.status import Problem

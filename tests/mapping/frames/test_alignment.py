@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from mapping.frames.alignment import NoTie, Seen, Tie, refined_on_points, tie
 from visloc.geometry import Camera, Pose, Similarity, rotation_angle
-from visloc.pose.colmap import project
+from visloc.pose.reprojection import project
 
 CAMERA = Camera("OPENCV", 640, 480, (520.0, 525.0, 320.0, 240.0, 0.1, -0.05, 0.0, 0.001))
 TURN = Rotation.from_euler("xyz", [20.0, -35.0, 140.0], degrees=True).as_matrix()

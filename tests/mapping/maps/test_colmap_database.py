@@ -21,7 +21,7 @@ from visloc.features import make_local_features
 from visloc.geometry import Pose
 from visloc.kapture import read_dataset
 from visloc.localization.localizer import Localizer
-from visloc.pose.colmap import pose_from_colmap
+from visloc.pose.reprojection import pose_from_colmap
 
 
 def test_photos_that_see_a_point_match_there() -> None:

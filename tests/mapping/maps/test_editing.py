@@ -17,8 +17,7 @@ from visloc.archive import Geodetic, Map, MapContent, MapStore
 from visloc.archive.places import enu_of
 from visloc.errors import Conflict
 from visloc.geometry import Camera, Pose, Similarity
-from visloc.pose.reprojection import reprojection_errors
-from visloc.pose.views import MatchedView
+from visloc.pose.reprojection import MatchedView, reprojection_errors
 
 TURN = Pose.from_quaternion([0.8, 0.1, -0.5, 0.3], [0, 0, 0]).rotation
 ELSEWHERE = Similarity(2.5, TURN, np.array([3.0, -40.0, 7.0]))

@@ -17,7 +17,7 @@ from mapping.methods.sparse.triangulation import reconstruct
 from mapping.methods.undoing import reconstruct_places
 from visloc.errors import refuse
 from visloc.geometry import Camera, Pose
-from visloc.pose.colmap import project
+from visloc.pose.reprojection import project
 
 CAMERA = Camera("SIMPLE_PINHOLE", 640, 480, (450.0, 320.0, 240.0))
 CONFIG = MAPPER_CONFIGS["config1"]

@@ -22,7 +22,7 @@ from visloc.archive import (
     write_map,
 )
 from visloc.geometry import Camera, Pose
-from visloc.pose.colmap import project
+from visloc.pose.reprojection import project
 
 CAMERA = Camera("PINHOLE", 320, 240, (220.0, 220.0, 160.0, 120.0))
 MakeMap = Callable[..., Map]

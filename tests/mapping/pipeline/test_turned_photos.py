@@ -27,7 +27,7 @@ from visloc.archive import Map, MapStore
 from visloc.errors import DatasetError
 from visloc.evaluation import pose_error
 from visloc.features import make_local_features
-from visloc.features.photo import extract_features
+from visloc.features.resolution import extract_features
 from visloc.geometry import Camera, Pose
 from visloc.kapture import read_dataset
 from visloc.localization.localizer import Localizer

@@ -21,7 +21,7 @@ from mapping.stages.depth import (
 from visloc.errors import DatasetError, InvalidInput, TooLarge
 from visloc.geometry import Camera, Pose
 from visloc.kapture import Dataset, FileRecord, Sensor, read_dataset
-from visloc.pose.colmap import normalized_rays, project
+from visloc.pose.reprojection import normalized_rays, project
 
 SMALL = Camera("SIMPLE_PINHOLE", 4, 3, (4.0, 2.0, 1.5))
 DEPTH = Camera("SIMPLE_PINHOLE", 320, 240, (290.0, 160.0, 120.0))

@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from service.engine.gather import together
+from service.engine.instant_tasks import together
 
 
 def test_when_one_fails_the_others_have_let_go() -> None:

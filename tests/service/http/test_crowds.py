@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from service.http import crowds
-from service.http.crowds import Patient
+from service.http import acceptor as crowds
+from service.http.acceptor import Patient
 
 
 def part(body: bytes, *, more: bool) -> dict[str, object]:

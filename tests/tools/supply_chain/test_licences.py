@@ -4,7 +4,7 @@ import copy
 from pathlib import Path
 from typing import Any
 
-import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
+import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.reprojection
 import pycolmap
 import pytest
 

@@ -12,7 +12,7 @@ from visloc.features.framing import (
     unturned_points,
 )
 from visloc.features.local.sift import SiftExtractor
-from visloc.features.photo import extract_features
+from visloc.features.resolution import extract_features
 from visloc.photos.reading import Photo
 
 WIDTH, HEIGHT = 90, 60

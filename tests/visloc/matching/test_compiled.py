@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from visloc.matching import compiled
-from visloc.matching.nearest import nearest
+from visloc.matching.products import nearest
 
 MACHINE = (platform.system(), platform.machine())
 needs_library = pytest.mark.skipif(

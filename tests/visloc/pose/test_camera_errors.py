@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 
 from visloc.geometry import Camera, Pose
 from visloc.pose.camera_errors import PRIORS, CameraErrors, LensEvidence, find_camera_errors
-from visloc.pose.centre import position_covariance
-from visloc.pose.colmap import project
+from visloc.pose.covariance import position_covariance
 from visloc.pose.generalized import refine_generalized_pose
 from visloc.pose.motion import moved
-from visloc.pose.views import MatchedView
+from visloc.pose.reprojection import MatchedView, project
 from visloc.types import CameraSource
 
 TRUE = Camera("PINHOLE", 640, 480, (460.0, 460.0, 322.0, 238.0))

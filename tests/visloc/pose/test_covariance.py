@@ -12,12 +12,10 @@ from scipy.stats import chi2
 
 from samples.trajectories import stereo_rig
 from visloc.geometry import Camera, Pose
-from visloc.pose.centre import position_covariance, with_origin
-from visloc.pose.colmap import normalized_rays, project
-from visloc.pose.covariance import pose_covariance
+from visloc.pose.covariance import pose_covariance, position_covariance, with_origin
 from visloc.pose.generalized import estimate_generalized_pose
 from visloc.pose.refinement import LOSS_SCALE_PX
-from visloc.pose.views import MatchedView
+from visloc.pose.reprojection import MatchedView, normalized_rays, project
 
 CAMERA = Camera("PINHOLE", 640, 480, (500.0, 510.0, 322.0, 239.0))
 ALONE = [Pose.identity()]

@@ -10,10 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from visloc.evaluation import pose_error
 from visloc.geometry import CAMERA_MODELS, Camera, Pose
-from visloc.pose.colmap import normalized_rays
 from visloc.pose.generalized import estimate_generalized_pose, refine_generalized_pose
-from visloc.pose.reprojection import reprojection_errors
-from visloc.pose.views import MatchedView
+from visloc.pose.reprojection import MatchedView, normalized_rays, reprojection_errors
 
 CAMERA = Camera("PINHOLE", 640, 480, (500.0, 510.0, 322.0, 239.0))
 DISTORTION = {"k": 0.02, "k1": 0.03, "k2": -0.01, "p1": 1e-3, "p2": -1e-3, "omega": 0.8}

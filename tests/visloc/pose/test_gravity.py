@@ -8,10 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from visloc.evaluation import pose_error
 from visloc.geometry import Camera, Pose
-from visloc.pose.colmap import normalized_rays
 from visloc.pose.generalized import GeneralizedPose, estimate_generalized_pose
 from visloc.pose.gravity import KnownGravity, find_upright_poses, gravity_deviation
-from visloc.pose.views import MatchedView
+from visloc.pose.reprojection import MatchedView, normalized_rays
 
 CAMERA = Camera("PINHOLE", 640, 480, (500.0, 510.0, 322.0, 239.0))
 ALONE = [Pose.identity()]

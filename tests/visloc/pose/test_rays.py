@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from visloc.geometry import Camera
-from visloc.pose.colmap import normalized_rays
+from visloc.pose.reprojection import normalized_rays
 
 WIDE = {
     "OPENCV_FISHEYE": (280.0, 280.0, 500.0, 500.0, 0, 0, 0, 0),

@@ -13,11 +13,15 @@ from scipy.spatial.transform import Rotation
 
 from visloc.evaluation import pose_error
 from visloc.geometry import CAMERA_MODELS, Camera, Pose
-from visloc.pose.colmap import normalized_rays, project
 from visloc.pose.motion import moved
 from visloc.pose.refinement import LOSS_SCALE_PX, refine
-from visloc.pose.reprojection import linearized, reprojection_errors
-from visloc.pose.views import MatchedView
+from visloc.pose.reprojection import (
+    MatchedView,
+    linearized,
+    normalized_rays,
+    project,
+    reprojection_errors,
+)
 
 CAMERA = Camera("PINHOLE", 640, 480, (500.0, 510.0, 322.0, 239.0))
 RIG = [

@@ -7,10 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from visloc.options import Fusion
-from visloc.retrieval.excluded import excluded_photos
 from visloc.retrieval.fusion import LateFusion
-from visloc.retrieval.index import Retrieved, compare, retrieve
-from visloc.retrieval.rows import GlobalRows
+from visloc.retrieval.index import GlobalRows, Retrieved, compare, excluded_photos, retrieve
 
 NUM, DIM = 60, 6
 

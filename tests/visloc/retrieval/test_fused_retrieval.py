@@ -12,8 +12,7 @@ import visloc.retrieval.index as retrieval
 from tests.visloc.retrieval.made_lists import inverted
 from visloc.options import Fusion
 from visloc.retrieval.fusion import LateFusion
-from visloc.retrieval.index import retrieve
-from visloc.retrieval.rows import GlobalRows
+from visloc.retrieval.index import GlobalRows, retrieve
 
 EVERY = pytest.mark.parametrize("fusion", Fusion)
 NUM, DIM = 400, 16

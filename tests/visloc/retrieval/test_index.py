@@ -2,8 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from visloc.retrieval.index import retrieve
-from visloc.retrieval.rows import GlobalRows
+from visloc.retrieval.index import GlobalRows, retrieve
 
 
 def test_retrieve_ranks_by_cosine_and_reports_it() -> None:

@@ -13,7 +13,7 @@ import visloc.retrieval.index as retrieval
 from tests.visloc.retrieval.made_lists import inverted
 from visloc.archive.index_files import check_lists, sizes_fit
 from visloc.errors import MapCorrupt
-from visloc.retrieval.index import retrieve
+from visloc.retrieval.index import GlobalRows, in_8_bits, retrieve
 from visloc.retrieval.inverted import (
     InvertedFile,
     bytes_of,
@@ -22,7 +22,6 @@ from visloc.retrieval.inverted import (
     row_bytes,
     width_of,
 )
-from visloc.retrieval.rows import GlobalRows, in_8_bits
 
 PLACES, PHOTOS, DIM = 40, 25, 96
 NUM = PLACES * PHOTOS

@@ -5,8 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from visloc.retrieval.index import Retrieved, retrieve
-from visloc.retrieval.rows import GlobalRows
+from visloc.retrieval.index import GlobalRows, Retrieved, retrieve
 
 Vectors = dict[str, NDArray[np.float32]]
 Index = dict[str, GlobalRows]

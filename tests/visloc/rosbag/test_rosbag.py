@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from tests.rosbags_made import SECOND, Made, write_messages
 from visloc.errors import Conflict, DatasetError
 from visloc.geometry import Camera, Pose
-from visloc.pose.colmap import project
+from visloc.pose.reprojection import project
 from visloc.rosbag import Picture, PoseStamped, Transforms, camera_from_info, open_bag, write_poses
 from visloc.rosbag.pictures import depth_in_metres, pixels_of
 from visloc.rosbag.writing import ros_covariance

@@ -12,10 +12,9 @@ from visloc.evaluation import pose_error
 from visloc.geometry import Camera, Pose
 from visloc.localization.solving import solve_instant
 from visloc.options import DEFAULT_PRESET, PRESETS, LocalizeOptions
-from visloc.pose.colmap import normalized_rays
 from visloc.pose.generalized import estimate_generalized_pose
 from visloc.pose.motion import UncertainPose
-from visloc.pose.views import MatchedView
+from visloc.pose.reprojection import MatchedView, normalized_rays
 from visloc.priors import NO_PRIORS, PosePrior, Priors
 from visloc.sequences.group import find_groups
 

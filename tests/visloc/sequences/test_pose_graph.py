@@ -7,7 +7,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from visloc.geometry import Camera, Pose
-from visloc.pose.colmap import project
 from visloc.pose.motion import (
     RelativeMotion,
     UncertainPose,
@@ -18,7 +17,7 @@ from visloc.pose.motion import (
     link_from_motion,
     moved,
 )
-from visloc.pose.views import MatchedView
+from visloc.pose.reprojection import MatchedView, project
 from visloc.sequences.pose_graph import Chain, solve_chain
 
 RNG = np.random.default_rng(0)

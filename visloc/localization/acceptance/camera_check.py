@@ -21,7 +21,7 @@ from visloc.pose.intrinsics import (
     FoundIntrinsics,
     find_intrinsics,
 )
-from visloc.pose.views import MatchedView
+from visloc.pose.reprojection import MatchedView
 from visloc.types import CameraSource
 
 # Relative error (standard deviation) of a correct camera: of its focal length, and of fx / fy. A

@@ -20,10 +20,8 @@ from scipy.spatial import KDTree
 from visloc.geometry import Camera, Pose
 from visloc.localization.map_view.constraints import MapGeometry
 from visloc.matching.products import EightBitRows
-from visloc.pose.centre import position_covariance
-from visloc.pose.colmap import project
-from visloc.pose.reprojection import reprojection_errors
-from visloc.pose.views import MatchedView
+from visloc.pose.covariance import position_covariance
+from visloc.pose.reprojection import MatchedView, project, reprojection_errors
 
 # How many mapping photos stand for a camera at the pose; landmarks of each, and of all.
 _NUM_PHOTOS = 8

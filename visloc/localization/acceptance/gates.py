@@ -32,7 +32,7 @@ from visloc.pose.generalized import (
     estimate_generalized_pose,
     refine_generalized_pose,
 )
-from visloc.pose.views import MatchedView
+from visloc.pose.reprojection import MatchedView
 from visloc.types import CameraSource, Reason, Refusal
 
 # The default max_error_px applies to photos whose longer side has at least this many pixels, and

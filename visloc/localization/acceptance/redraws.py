@@ -18,11 +18,10 @@ from scipy.special import chdtri
 
 from visloc.localization.acceptance.gates import Problem, asks_for_weak_poses
 from visloc.localization.acceptance.judge import TIE_ANGLE, TIE_REACH_SHARE
-from visloc.pose.centre import largest_std
+from visloc.pose.covariance import largest_std
 from visloc.pose.distance import normalized_distance2
 from visloc.pose.generalized import GeneralizedPose
-from visloc.pose.reprojection import reprojection_errors
-from visloc.pose.views import MatchedView
+from visloc.pose.reprojection import MatchedView, reprojection_errors
 from visloc.types import Reason, Refusal
 
 # The ring beyond the inlier threshold out to so many times it has the area of the disc within. If

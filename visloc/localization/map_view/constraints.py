@@ -1,4 +1,4 @@
-"""Priors in one map: which photos to search, and which poses to refuse.
+"""Where the photos of a map stand, and priors in it: which photos to search, and which poses to refuse.
 
 All coordinates are relative to the map's origin, where numbers are small.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -20,15 +20,12 @@ from visloc.errors import refuse
 from visloc.features.resolution import Resolution, WorkingResolution
 from visloc.geometry import Pose
 from visloc.localization.map_view.local_model import LocalModel
-from visloc.localization.map_view.viewpoints import Viewpoints
 from visloc.matching.products import EightBitRows
-from visloc.pose.centre import largest_std, with_origin
-from visloc.pose.colmap import normalized_rays
-from visloc.pose.distance import mahalanobis2
+from visloc.pose.covariance import PHOTO_ONLY, MapErrors, largest_std, with_origin
+from visloc.pose.distance import mahalanobis2, viewpoints_apart
 from visloc.pose.generalized import MAX_FOCAL, MIN_FOCAL
 from visloc.pose.gravity import KnownGravity, gravity_deviation
-from visloc.pose.map_errors import PHOTO_ONLY, MapErrors
-from visloc.pose.views import MatchedView
+from visloc.pose.reprojection import MatchedView, normalized_rays
 from visloc.priors import HEIGHT_REACH, POSE_PRIOR_STDS, REACH, GnssPrior, Priors
 
 _LEAST_REACH = 1e-9  # of a map whose photos see nothing
@@ -376,3 +373,34 @@ def _angles(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float6
     return np.asarray(
         np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.einsum("ni,ni->n", a, b))
     )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Viewpoints:
+    """The mapping photos' poses, relative to the map's origin.
+
+    Attributes:
+        centers: (n, 3) float64.
+        rotations: (n, 3, 3) float64, camera from world.
+        reach: median distance from photos to what they see, units of the world; above 0.
+    """
+
+    centers: NDArray[np.float64]
+    rotations: NDArray[np.float64]
+    reach: float
+
+    def __len__(self) -> int:
+        return len(self.centers)
+
+    def of(self, images: NDArray[np.int64]) -> Viewpoints:
+        """Return the viewpoints of some photos."""
+        return Viewpoints(self.centers[images], self.rotations[images], self.reach)
+
+    def pose(self, image: int) -> Pose:
+        """``cam_from_local`` of one photo."""
+        rotation = self.rotations[image]
+        return Pose(rotation, -rotation @ self.centers[image])
+
+    def apart_from(self, pose: Pose) -> NDArray[np.float64]:
+        """Return the distance (n,) of each photo from a pose, in radians (``viewpoints_apart``)."""
+        return viewpoints_apart(self.rotations, self.centers, pose, self.reach)

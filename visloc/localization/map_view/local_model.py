@@ -22,7 +22,7 @@ from visloc.geometry import Pose
 from visloc.matching.correspondences import mutual_nearest_neighbours
 from visloc.matching.products import EightBitRows, in_threads
 from visloc.matching.verification import epipolar_errors
-from visloc.pose.colmap import normalized_rays
+from visloc.pose.reprojection import normalized_rays
 from visloc.pose.triangulation import triangulated
 from visloc.retrieval.index import retrieve
 

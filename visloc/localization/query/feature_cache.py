@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from visloc.features import LocalFeatureExtractor
 from visloc.features.framing import AS_IT_IS, Framing
-from visloc.features.photo import extract_features, where_counting
+from visloc.features.resolution import extract_features, where_counting
 from visloc.options import Extraction, LocalizeOptions, ReadAs
 from visloc.photos.reading import Photo
 from visloc.types import LocalFeatures

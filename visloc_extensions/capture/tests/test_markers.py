@@ -6,7 +6,7 @@ import pytest
 
 from mapping.stages.landmarks import View
 from visloc.geometry import Camera, Pose
-from visloc.pose.colmap import project
+from visloc.pose.reprojection import project
 from visloc_extensions.capture.markers import Sighting, find_markers, marker_sides
 
 CAMERA = Camera("SIMPLE_RADIAL", 800, 600, (700.0, 400.0, 300.0, -0.05))

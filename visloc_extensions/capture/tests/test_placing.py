@@ -12,7 +12,7 @@ from mapping.stages.photos import MappingPhoto
 from visloc.archive import Anchor
 from visloc.geometry import Camera, Pose, Similarity
 from visloc.kapture import FileRecord
-from visloc.pose.colmap import project
+from visloc.pose.reprojection import project
 from visloc_extensions.capture.placing import Yardstick, place
 
 CAMERA = Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mapping.films.video import VideoFacts
 from visloc.geometry import Camera, Pose
-from visloc.pose.colmap import project
+from visloc.pose.reprojection import project
 from visloc_extensions.capture.choosing import ChosenFrames
 from visloc_extensions.capture.frames import FilmedVideo
 from visloc_extensions.capture.motion import Motion

@@ -12,7 +12,7 @@ import pytest
 
 from mapping.importers import read_model
 from visloc.errors import DatasetError
-from visloc.pose.colmap import project
+from visloc.pose.reprojection import project
 from visloc_extensions.importers.openmvg import read
 from visloc_extensions.importers.tracks import reprojection_errors
 

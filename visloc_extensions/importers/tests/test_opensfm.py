@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from visloc.errors import DatasetError
 from visloc.geodesy import geodetic_from_enu
-from visloc.pose.colmap import project
+from visloc.pose.reprojection import project
 from visloc_extensions.importers.opensfm import read
 from visloc_extensions.importers.tracks import reprojection_errors
 

@@ -29,8 +29,7 @@ from visloc.evaluation import pose_error
 from visloc.geometry import Pose, Similarity
 from visloc.localization.acceptance.gates import registration_for
 from visloc.options import LocalizeOptions
-from visloc.pose.reprojection import reprojection_errors
-from visloc.pose.views import MatchedView
+from visloc.pose.reprojection import MatchedView, reprojection_errors
 from visloc_extensions.living_maps.updating.localizing import Placed
 
 T = TypeVar("T")

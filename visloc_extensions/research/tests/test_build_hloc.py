@@ -33,7 +33,7 @@ from visloc.matching.correspondences import mutual_nearest_neighbours
 from visloc.matching.products import round_descriptors
 from visloc.options import LocalizeOptions
 from visloc.photos.reading import read_photo_file
-from visloc.pose.colmap import project
+from visloc.pose.reprojection import project
 from visloc.types import LocalFeatures, Localized, QueryFeatures
 from visloc_extensions.research.hloc import import_features
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mapping.methods.matching.fixed_things import Tally
 from mapping.stages.camera_mask import CameraMask, are_masked
 from visloc.geometry import Camera, Pose
-from visloc.pose.colmap import project
+from visloc.pose.reprojection import project
 
 CAMERA = Camera("PINHOLE", 640, 480, (450.0, 450.0, 320.0, 240.0))
 RANDOM = np.random.default_rng(3)

@@ -29,7 +29,7 @@ from visloc.kapture import FileRecord
 from visloc.kapture.matches import open_matches, write_matches
 from visloc.matching.products import EightBitRows, round_descriptors
 from visloc.options import Inference
-from visloc.pose.colmap import project
+from visloc.pose.reprojection import project
 from visloc.types import Fingerprint, LocalFeatures
 
 CAMERA = Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))

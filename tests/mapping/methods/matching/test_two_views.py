@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from mapping.methods.matching.two_views import fits_two_views, log10_chance
 from visloc.geometry import Camera, Pose
-from visloc.pose.colmap import project
+from visloc.pose.reprojection import project
 
 CAMERA = Camera("OPENCV", 640, 480, (500.0, 510.0, 321.0, 242.0, -0.1, 0.02, 0.001, -0.002))
 SECOND = Pose(np.eye(3), np.array([-0.6, 0.1, 0.05]))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from mapping.methods.sparse.contradictions import ModelPhoto, Places, find_places
 from mapping.stages.landmarks import View
 from visloc.geometry import Camera, Pose
-from visloc.pose.colmap import project
+from visloc.pose.reprojection import project
 
 CAMERA = Camera("SIMPLE_PINHOLE", 640, 480, (450.0, 320.0, 240.0))
 NUM_POINTS, PHOTOS_EACH, DETECTED = 600, 8, 0.8

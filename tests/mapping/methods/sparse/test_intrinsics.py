@@ -6,7 +6,7 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
-import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
+import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.reprojection
 import pycolmap
 import pytest
 from numpy.typing import NDArray
@@ -24,7 +24,7 @@ from mapping.methods.sparse.triangulation import (
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera, Pose
 from visloc.kapture import Sensor
-from visloc.pose.colmap import project
+from visloc.pose.reprojection import project
 
 CONFIG = MAPPER_CONFIGS["config1"]
 WIDTH, HEIGHT, FOCAL = 800, 600, 700.0

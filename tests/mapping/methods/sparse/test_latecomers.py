@@ -16,7 +16,7 @@ from mapping.methods.sparse.latecomers import Late, place_latecomers
 from mapping.methods.sparse.model import MAPPER_CONFIGS, SfmPhoto, SparseModel
 from mapping.stages.landmarks import Observations, View
 from visloc.geometry import Camera, Pose
-from visloc.pose.colmap import project
+from visloc.pose.reprojection import project
 
 CAMERA = Camera("SIMPLE_PINHOLE", 640, 480, (450.0, 320.0, 240.0))
 CONFIG = MAPPER_CONFIGS["config1"]

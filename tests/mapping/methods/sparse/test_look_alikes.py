@@ -13,7 +13,7 @@ from mapping.methods.sparse.look_alikes import without_look_alikes
 from mapping.methods.sparse.model import MAPPER_CONFIGS, SfmPhoto
 from mapping.methods.sparse.triangulation import reconstruct
 from visloc.geometry import Camera, Pose
-from visloc.pose.colmap import project
+from visloc.pose.reprojection import project
 
 CAMERA = Camera("SIMPLE_PINHOLE", 640, 480, (450.0, 320.0, 240.0))
 NUM_POINTS, PHOTOS_EACH = 500, 8

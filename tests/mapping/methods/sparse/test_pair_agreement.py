@@ -14,7 +14,7 @@ from mapping.methods.sparse.model import SfmPhoto, SparseModel
 from mapping.methods.sparse.pair_agreement import contradicted_pairs, doubts_about_poses
 from mapping.stages.landmarks import Observations, View
 from visloc.geometry import Camera, Pose
-from visloc.pose.colmap import project
+from visloc.pose.reprojection import project
 
 CAMERA = Camera("PINHOLE", 640, 480, (450.0, 450.0, 320.0, 240.0))
 NUM_PHOTOS, NUM_ROOM, NUM_MOVING = 9, 200, 80

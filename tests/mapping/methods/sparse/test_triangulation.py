@@ -25,7 +25,7 @@ from mapping.methods.sparse.triangulation import (
 from visloc.errors import InvalidInput
 from visloc.evaluation import pose_error
 from visloc.geometry import Camera, Pose
-from visloc.pose.colmap import project
+from visloc.pose.reprojection import project
 
 CAMERA = Camera("OPENCV", 640, 480, (500.0, 510.0, 321.0, 242.0, -0.1, 0.02, 0.001, -0.002))
 CONFIG = MAPPER_CONFIGS["config1"]

@@ -14,10 +14,9 @@ from visloc.evaluation import pose_error
 from visloc.geometry import CAMERA_MODELS, Camera, Pose
 from visloc.localization.solving import Matches, Solved, solve_instant
 from visloc.options import LocalizeOptions, Solver
-from visloc.pose.colmap import project
 from visloc.pose.generalized import estimate_generalized_pose
 from visloc.pose.intrinsics import ASPECT, FOCAL, SHIFT_X, SHIFT_Y, find_intrinsics
-from visloc.pose.views import MatchedView
+from visloc.pose.reprojection import MatchedView, project
 from visloc.priors import NO_PRIORS, PositionPrior, Priors
 from visloc.types import CameraSource, Reason
 

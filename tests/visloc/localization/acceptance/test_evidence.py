@@ -27,9 +27,8 @@ from visloc.localization.map_view.constraints import Constraints
 from visloc.matching.products import EightBitRows
 from visloc.options import LocalizeOptions
 from visloc.photos.reading import Photo, read_photo
-from visloc.pose.colmap import project
 from visloc.pose.generalized import GeneralizedPose
-from visloc.pose.views import MatchedView
+from visloc.pose.reprojection import MatchedView, project
 from visloc.priors import NO_PRIORS
 from visloc.types import CameraSource, Localized, NotLocalized, Reason, Refusal
 

@@ -14,7 +14,7 @@ from visloc.localization.acceptance.gates import Problem
 from visloc.localization.map_view.constraints import Constraints
 from visloc.localization.solving import Matches, SeenImage, Solved, solve_instant
 from visloc.options import LocalizeOptions
-from visloc.pose.colmap import normalized_rays
+from visloc.pose.reprojection import normalized_rays
 from visloc.priors import NO_PRIORS
 from visloc.types import CameraSource, Reason
 

@@ -19,8 +19,7 @@ from visloc.geometry import Camera, Pose, Similarity, covariance_from_center
 from visloc.localization.localizer import Localizer
 from visloc.localization.map_view.constraints import Constraints, MapGeometry
 from visloc.options import LocalizeOptions
-from visloc.pose.colmap import normalized_rays, project
-from visloc.pose.views import MatchedView
+from visloc.pose.reprojection import MatchedView, normalized_rays, project
 from visloc.priors import (
     NO_PRIORS,
     GnssPrior,
@@ -31,7 +30,7 @@ from visloc.priors import (
     Priors,
     check_covariance,
 )
-from visloc.retrieval.rows import GlobalRows
+from visloc.retrieval.index import GlobalRows
 from visloc.types import Answer, Localized, NotLocalized, QueryFeatures, Reason
 
 TURNED = Pose(Rotation.from_rotvec([0.3, -1.2, 0.4]).as_matrix(), np.array([1.0, -2.0, 0.5]))
