@@ -1,4 +1,4 @@
-"""The id of a request, and how long it may take: what the caller asks for, within what the server allows."""
+"""The id of a request, and how long it may take, within what the server allows."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cameras, transforms, and the poses of answers: where a photo was taken, or a rig was, and how sure that is."""
+"""Cameras, transforms, and the poses of answers: where it was, and how sure that is."""
 
 from __future__ import annotations
 

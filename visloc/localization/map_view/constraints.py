@@ -1,4 +1,4 @@
-"""Where the photos of a map stand, and priors in it: which photos to search, and which poses to refuse.
+"""Where the photos of a map stand; by priors, which to search and which poses to refuse.
 
 All coordinates are relative to the map's origin, where numbers are small.
 """
