@@ -9,8 +9,9 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
-from mapping.films.video import SUFFIXES, is_live_photo, is_video, stems_of_photos
+from mapping.films.video import SUFFIXES
 from mapping.importers import ImportedImage, ImportedModel, read_model
+from mapping.importers.films import is_live_photo, is_video, stems_of_photos
 from mapping.importers.left_out import LeftOut, notes_on
 from mapping.importers.reading.photo_names import natural_order, photo_size
 from mapping.importers.scans import app_of

@@ -11,13 +11,13 @@ from typing import Any
 import cv2
 import pytest
 
+from tests.mapping.importers.conftest import panned, texture
 from visloc.archive import MapStore
 from visloc.errors import Conflict, InvalidInput, Unavailable, WeightsError
 from visloc.kapture import read_dataset
 from visloc_extensions.capture import job
 from visloc_extensions.capture.job import capture_map
 from visloc_extensions.capture.settings import CaptureSettings
-from visloc_extensions.capture.tests.conftest import panned, texture
 
 
 class Killed(Exception):

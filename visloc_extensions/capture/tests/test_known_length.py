@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.mapping.importers.conftest import panned
 from visloc.errors import InvalidInput
 from visloc_extensions.capture.job import Outlook, capture_map
 from visloc_extensions.capture.settings import CaptureSettings
-from visloc_extensions.capture.tests.conftest import panned
 
 
 def begins(_: Outlook) -> None:

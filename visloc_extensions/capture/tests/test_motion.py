@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from mapping.films.video import frames_of
+from tests.mapping.importers.conftest import panned, texture
 from visloc_extensions.capture.motion import measure_motion
-from visloc_extensions.capture.tests.conftest import panned, texture
 
 
 def test_the_path_is_how_far_the_picture_moved(make_video: Callable[..., Path]) -> None:
