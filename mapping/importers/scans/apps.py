@@ -25,7 +25,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from mapping.films.video import SHARPNESS_SIDE, Frame, frames_of, sharpness, video_facts, write_jpeg
 from mapping.importers import nerfstudio
 from mapping.importers.reading.json_fields import JsonValue, parse_json, read_json
 from mapping.importers.reading.photo_names import natural_order, photo_names, photo_size
@@ -46,6 +45,14 @@ from visloc.errors import refuse
 from visloc.geometry import MAX_IMAGE_SIDE, Camera
 from visloc.photos.formats import MALFORMED, png_samples
 from visloc.photos.reading import FILE_LIMITS
+from visloc_extensions.films.video import (
+    SHARPNESS_SIDE,
+    Frame,
+    frames_of,
+    sharpness,
+    video_facts,
+    write_jpeg,
+)
 
 _INTRINSICS, _SIZE = ("fx", "fy", "cx", "cy"), ("width", "height")
 

@@ -25,7 +25,7 @@ from visloc.geometry import Camera, Pose
 from visloc.kapture import Dataset, FileRecord, read_dataset
 from visloc.photos.reading import read_photo_file
 from visloc_extensions.capture.sources import find_sources, read_capture
-from visloc_extensions.capture.tests.test_video import turned
+from visloc_extensions.films.tests.test_video import turned
 
 _UPRIGHT = (0, 1, -1, 0)  # the display matrix of a phone held upright
 ARKIT = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -19,9 +19,9 @@ import numpy as np
 from av.error import FFmpegError
 from numpy.typing import NDArray
 
-from mapping.films.tone import is_high_range, to_standard_range
 from mapping.importers.films import opened_film, square_size, unreadable_film
 from visloc.errors import refuse
+from visloc_extensions.films.tone import is_high_range, to_standard_range
 
 SUFFIXES = (".mp4", ".m4v", ".mov", ".webm", ".mkv", ".3gp", ".3g2")
 SHARPNESS_SIDE = 960  # of the longer side: motion blur of a pixel or two is visible at this size

@@ -9,11 +9,11 @@ import av
 import numpy as np
 import pytest
 
-from mapping.films import video
-from mapping.films.video import frames_of, video_facts
 from mapping.importers.films import is_video
 from tests.mapping.importers.conftest import Picture, panned
 from visloc.errors import InvalidInput, TooLarge
+from visloc_extensions.films import video
+from visloc_extensions.films.video import frames_of, video_facts
 
 MakeVideo = Callable[..., Path]
 # tkhd's matrix, rows (a, b, u), (c, d, v), (x, y, w): p' = (a x + c y, b x + d y), y down.
