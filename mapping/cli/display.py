@@ -15,7 +15,6 @@ from rich.table import Table
 
 from mapping.cluster.stage_timings import Spent, StageCost
 from mapping.frames.georeference import Georeference
-from mapping.frames.rig_calibration import OUTLIER_MULTIPLE, RigCalibration, Spread
 from mapping.importers import ImportSummary
 from mapping.maps.cameras import camera_lines, cameras_of
 from visloc.archive import Map, MapStore
@@ -284,39 +283,3 @@ def print_import(summary: ImportSummary) -> None:
         + (", metric" if summary.metric else ", not known to be metric")
     )
     say_notes(summary.notes)
-
-
-def print_rig(calibration: RigCalibration) -> None:
-    """Print where the cameras of a rig are, and how well their instants agree."""
-    table = Table(
-        box=None,
-        title=f"rig {escape(calibration.rig)}, its frame is camera {escape(calibration.reference)}",
-        title_justify="left",
-    )
-    for name in ("camera", "through", "instants", "outliers", "degrees", "units", "position"):
-        table.add_column(name, justify="right" if name in ("instants", "outliers") else "left")
-    for name, camera in calibration.cameras.items():
-        position = " ".join(_figure(value) for value in camera.cam_from_rig.center)
-        if camera.relative is None or camera.relative_to is None:
-            table.add_row(escape(name), "", "", "", "", "", position)
-            continue
-        found = camera.relative
-        table.add_row(
-            *(escape(name), escape(camera.relative_to), str(found.instants), str(found.outliers)),
-            *(_deviation(found.rotation_deg), _deviation(found.position), position),
-        )
-    OUT.print(table)
-    say(
-        "degrees, units: deviation of the instants from the estimate, median / 90 %; "
-        f"outliers: instants {OUTLIER_MULTIPLE:g} times further off than the median"
-    )
-    say_notes(calibration.notes)
-
-
-def _deviation(spread: Spread) -> str:
-    return f"{_figure(spread.median)} / {_figure(spread.p90)}"
-
-
-def _figure(value: float) -> str:
-    """Return four digits, and 0 for round-off."""
-    return f"{value:.4g}" if abs(value) > 1e-9 else "0"

@@ -12,7 +12,6 @@ import typer
 from mapping.cli.acceptance import use
 from mapping.cli.build import build, import_
 from mapping.cli.datasets import (
-    calibrate_rig_command,
     pairs,
     sample,
 )
@@ -26,7 +25,6 @@ from visloc.extensions import MAPPING_COMMANDS, extensions, load
 COMMANDS: Mapping[str, Callable[..., None]] = {
     "build": build,
     "pairs": pairs,
-    "calibrate-rig": calibrate_rig_command,
     "import": import_,
     "anchor": anchor,
     "edit": edit,

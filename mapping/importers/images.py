@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags
 
-from mapping.films.video import is_live_photo, stems_of_photos
+from mapping.importers.films import is_live_photo, stems_of_photos
 from mapping.importers.left_out import notes_on
 from mapping.importers.model import ImportedImage, ImportedModel
 from mapping.importers.reading.photo_names import natural_order

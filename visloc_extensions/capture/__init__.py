@@ -1,1 +1,1 @@
-"""`mapping capture`: from a phone's videos and photos to a published map."""
+"""`mapping capture`: from a phone's videos and photos to a published map. Needs ``films``."""

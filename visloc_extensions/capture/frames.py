@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.films.video import Frame, VideoFacts, frames_of, video_facts, write_jpeg
 from mapping.progress import ItemProgress
 from mapping.stages.work_folder import WorkFolder, key_of
 from visloc.archive import sha256_of
 from visloc.errors import refuse
 from visloc_extensions.capture.choosing import ChosenFrames, choose_frames
 from visloc_extensions.capture.motion import Motion, measure_motion
+from visloc_extensions.films.video import Frame, VideoFacts, frames_of, video_facts, write_jpeg
 
 _REVISION = 1
 

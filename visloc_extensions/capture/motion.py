@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.films.video import SHARPNESS_SIDE, Frame, sharpness
+from visloc_extensions.films.video import SHARPNESS_SIDE, Frame, sharpness
 
 _TRACKING_SIDE = 320
 _CORNERS, _LEAST_CORNERS = 150, 12

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
-from mapping.films.video import SUFFIXES, is_live_photo, is_video, stems_of_photos
 from mapping.importers import ImportedImage, ImportedModel, read_model
+from mapping.importers.films import is_live_photo, is_video, stems_of_photos
 from mapping.importers.left_out import LeftOut, notes_on
 from mapping.importers.reading.photo_names import natural_order, photo_size
 from mapping.importers.recognized import importer_of
@@ -23,6 +23,7 @@ from visloc.kapture import GnssRecord, Sensor
 from visloc.kapture.dataset import UNKNOWN_CAMERA
 from visloc.photos.file_kinds import kind_of
 from visloc_extensions.capture.frames import FilmedVideo, study_video, write_photos
+from visloc_extensions.films.video import SUFFIXES
 
 _EXPORT, _NERFSTUDIO = "transforms.json", "nerfstudio"
 _GNSS = "gnss"

@@ -25,7 +25,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from mapping.films.video import SHARPNESS_SIDE, Frame, frames_of, sharpness, video_facts, write_jpeg
 from mapping.importers import nerfstudio
 from mapping.importers.reading.json_fields import JsonValue, parse_json, read_json
 from mapping.importers.reading.photo_names import natural_order, photo_names, photo_size
@@ -35,6 +34,14 @@ from visloc.errors import refuse
 from visloc.geometry import MAX_IMAGE_SIDE, Camera
 from visloc.photos.formats import MALFORMED, png_samples
 from visloc.photos.reading import FILE_LIMITS
+from visloc_extensions.films.video import (
+    SHARPNESS_SIDE,
+    Frame,
+    frames_of,
+    sharpness,
+    video_facts,
+    write_jpeg,
+)
 from visloc_extensions.scans.frames import (
     OURS_FROM_ARKIT,
     ScanFrame,

@@ -21,7 +21,7 @@ from rich.console import ConsoleDimensions
 from mapping.cli import main as cli
 from mapping.pairing import PAIRINGS
 from visloc.archive import MapStore, open_map
-from visloc.kapture import read_dataset, write_dataset
+from visloc.kapture import read_dataset
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -174,7 +174,6 @@ def test_verify_tells_that_the_features_of_a_map_are_others(
             "[build.gravity] --gravity: this is not a",
         ),
         (("build", "x", "--map", "new", "--gravity", "0,nan,1"), "[build.gravity] --gravity"),
-        (("calibrate-rig", "nowhere"), "[kapture.no_dataset] sensors/sensors.txt: nowhere"),
         (("import", "colmap", "x"), "[import.target] --map: say whether to make"),
         (("import", "colmap", "x", "--map", "m", "--output", "o"), "[import.target] --map"),
         (("import", "meshroom", "x", "--output", "o"), "[import.unknown_format] FORMAT"),
@@ -242,7 +241,7 @@ def test_what_the_system_refuses_is_one_line_too(run: Run, tmp_path: Path) -> No
 @pytest.mark.parametrize(
     "command",
     [
-        *("", "build", "pairs", "calibrate-rig", "import", "export", "inspect", "verify"),
+        *("", "build", "pairs", "import", "export", "inspect", "verify"),
         *("export-features", "sample"),
     ],
 )
@@ -487,52 +486,6 @@ def test_gravity_is_in_the_map_and_shown(run: Run, sample: Path, tmp_path: Path)
     assert opened.gravity is not None
     assert opened.gravity.tolist() == [-0.6, 0.0, -0.8]
     assert json.loads(run("inspect", "room", *maps, "--json")[1])["gravity"] == [-0.6, 0.0, -0.8]
-
-
-def test_a_rig_is_calibrated_shown_and_written_once(run: Run, sample: Path, tmp_path: Path) -> None:
-    known = read_dataset(sample / "mapping")
-    poses = {(r.timestamp, r.sensor_id): known.pose(r) for r in known.images}
-    write_dataset(
-        replace(known, root=tmp_path, rigs={}, trajectories=poses)  # type: ignore[arg-type]
-    )
-    command = ("calibrate-rig", tmp_path, "--rig", "car", "--reference", "right")
-    output = tmp_path / "sensors" / "rigs.txt"
-    status, out, err = run(*command, "--cameras", "left, right")
-    assert (status, err) == (0, "")
-    assert "rig car, its frame is camera right" in out
-    assert re.search(r"left +right +4 +0 +0 / 0 +0 / 0 +-0.1999", out)
-    assert out.endswith(f"rig: {output}\n")
-    assert list(read_dataset(tmp_path).rigs["car"]) == ["right", "left"]
-
-    text = output.read_text()
-    error = error_of(run(*command))
-    assert f"error [rig.exists] {output}" in error
-    assert "--output" in error
-    assert output.read_text() == text
-    assert run(*command, "--output", tmp_path / "new" / "rigs.txt")[0] == 0
-    assert "left" in (tmp_path / "new" / "rigs.txt").read_text()
-
-
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        (
-            ("--cameras", "left,roof"),
-            "[rig.cameras] --cameras: the dataset does not have these cameras",
-        ),
-        (("--cameras", ""), "[rig.cameras] --cameras: a rig needs at least two cameras"),
-        (("--reference", "roof"), "[rig.reference] --reference: the reference is not one"),
-        (("--rig", "left"), "[rig.id] --rig: this is not a valid id of a rig"),
-        (("--rig", "a,b"), "[kapture.field]"),
-    ],
-)
-def test_a_rig_that_cannot_be_calibrated_is_one_line(
-    run: Run, sample: Path, tmp_path: Path, options: tuple[str, ...], said: str
-) -> None:
-    output = tmp_path / "rigs.txt"
-    error = error_of(run("calibrate-rig", sample / "mapping", "--output", output, *options))
-    assert f"error {said}" in error
-    assert not output.exists()
 
 
 def test_ctrl_c_ends_a_build_with_130_and_says_that_it_resumes(

@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import pytest
 
-from mapping.films.video import VideoFacts
 from mapping.methods.sparse.intrinsics import CAMERAS, CameraOrigin, Reason
 from visloc.archive.schema import Doubt
 from visloc_extensions.capture.account import fates, film_again, verdict
@@ -20,6 +19,7 @@ from visloc_extensions.capture.job import Captured
 from visloc_extensions.capture.motion import Motion
 from visloc_extensions.capture.picture import draw_walk
 from visloc_extensions.capture.trying import Trials, try_photos
+from visloc_extensions.films.video import VideoFacts
 
 
 class _Image:

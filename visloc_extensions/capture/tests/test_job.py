@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import pytest
 
-from tests.mapping.films.conftest import panned, texture
+from tests.mapping.importers.conftest import panned, texture
 from visloc.archive import MapStore
 from visloc.errors import Conflict, InvalidInput, Unavailable, WeightsError
 from visloc.kapture import read_dataset

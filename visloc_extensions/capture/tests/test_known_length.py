@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.mapping.films.conftest import panned
+from tests.mapping.importers.conftest import panned
 from visloc.errors import InvalidInput
 from visloc_extensions.capture.job import Outlook, capture_map
 from visloc_extensions.capture.settings import CaptureSettings

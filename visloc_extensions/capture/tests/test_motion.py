@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from mapping.films.video import frames_of
-from tests.mapping.films.conftest import panned, texture
+from tests.mapping.importers.conftest import panned, texture
 from visloc_extensions.capture.motion import measure_motion
+from visloc_extensions.films.video import frames_of
 
 
 def test_the_path_is_how_far_the_picture_moved(make_video: Callable[..., Path]) -> None:

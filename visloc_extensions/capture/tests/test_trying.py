@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mapping.films.video import VideoFacts
 from visloc.geometry import Camera, Pose
 from visloc.pose.reprojection import project
 from visloc_extensions.capture.choosing import ChosenFrames
 from visloc_extensions.capture.frames import FilmedVideo
 from visloc_extensions.capture.motion import Motion
 from visloc_extensions.capture.trying import doubts_of_capture, out_of_order, try_photos
+from visloc_extensions.films.video import VideoFacts
 
 CAMERA = Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))
 FRAMES = 24

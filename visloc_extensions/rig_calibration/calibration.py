@@ -1,4 +1,4 @@
-"""``mapping calibrate-rig``: where cameras sit on a rig, estimated from posed photos.
+"""Where cameras sit on a rig, estimated from posed photos.
 
 At every instant at which two cameras took photos with poses, those poses give one sample of where
 one camera is in the frame of the other. A rig has one such relative pose; the samples scatter

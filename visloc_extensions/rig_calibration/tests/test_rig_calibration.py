@@ -9,18 +9,18 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from mapping.frames.rig_calibration import (
+from mapping.maps.export import export_map
+from visloc.archive import Map
+from visloc.errors import Conflict, DatasetError, InvalidInput, TooLarge
+from visloc.geometry import Camera, Pose, rotation_angle
+from visloc.kapture import Dataset, FileRecord, Sensor, read_dataset, write_dataset
+from visloc_extensions.rig_calibration.calibration import (
     MAX_CAMERAS,
     MIN_INSTANTS,
     RigCalibration,
     calibrate_rig,
     write_calibration,
 )
-from mapping.maps.export import export_map
-from visloc.archive import Map
-from visloc.errors import Conflict, DatasetError, InvalidInput, TooLarge
-from visloc.geometry import Camera, Pose, rotation_angle
-from visloc.kapture import Dataset, FileRecord, Sensor, read_dataset, write_dataset
 
 CAMERA = Camera("PINHOLE", 64, 48, (50.0, 50.0, 32.0, 24.0))
 # Of three cameras the first is the frame.

@@ -1,0 +1,1 @@
+"""Frames of videos, for the extensions ``capture`` and ``scans``, which need it."""
