@@ -11,7 +11,6 @@ from typing import Annotated, NoReturn
 import typer
 from rich.console import Console
 
-from clients.cli.bag import bag
 from clients.cli.compare import compare
 from clients.cli.dataset import benchmark, localize_batch
 from clients.cli.display import print_line, print_result
@@ -122,7 +121,6 @@ app.command("batch")(localize_batch)
 app.command()(benchmark)
 app.add_typer(maps_app, name="maps")
 app.command()(compare)
-app.command()(bag)
 app.command()(evaluate)
 app.command()(submit)
 app.command()(retrieve)
