@@ -11,7 +11,8 @@ import PIL.Image
 import pycolmap
 import pytest
 
-from clients.evaluation.pose_files import of_photos, read_poses
+from clients.evaluation.pairs import of_photos
+from clients.evaluation.pose_files import read_poses
 from clients.evaluation.queries import read_queries
 from clients.evaluation.results import read_results, write_poses
 from clients.evaluation.scoring import read_conditions

@@ -10,7 +10,8 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-from clients.evaluation.pose_files import KnownPose, of_photos, read_poses
+from clients.evaluation.pairs import of_photos
+from clients.evaluation.pose_files import KnownPose, read_poses
 from visloc.accuracy import Compared, accuracy_of
 from visloc.errors import refuse
 from visloc.evaluation import Threshold

@@ -12,7 +12,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from clients.cli.main import main
-from clients.evaluation.pose_files import of_photos, read_poses
+from clients.evaluation.pairs import of_photos
+from clients.evaluation.pose_files import read_poses
 from clients.evaluation.scoring import read_conditions
 from visloc.errors import DatasetError, InvalidInput
 
