@@ -9,9 +9,8 @@ from typing import TypeVar
 from urllib.parse import unquote
 
 from clients.evaluation.queries import Query
-from clients.evaluation.run import Outcome
 from visloc.errors import refuse
-from visloc.kapture.pairs import read_pair_rows, write_pair_rows
+from visloc.kapture.pairs import read_pair_rows
 
 _T = TypeVar("_T")
 
@@ -77,19 +76,3 @@ def read_query_pairs(path: Path, queries: Sequence[Query]) -> dict[str, tuple[st
             got=next(iter(photos), "no pair"),
         )
     return {name: tuple(named) for name, named in found.items()}
-
-
-def write_query_pairs(path: Path, outcomes: Iterable[Outcome]) -> int:
-    """Write the mapping photos that each answer was matched with, best first.
-
-    Returns:
-        How many pairs were written.
-    """
-    rows = [
-        (outcome.query.name, image.image, image.score)
-        for outcome in outcomes
-        if outcome.result is not None
-        for image in outcome.result.retrieved
-    ]
-    write_pair_rows(path, rows)
-    return len(rows)

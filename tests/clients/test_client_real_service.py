@@ -131,43 +131,6 @@ def test_priors_keep_a_photo_from_being_found_elsewhere(
                 assert answer.localized is is_localized
 
 
-def test_the_usual_values_of_an_axis_are_compared(
-    doors: tuple[str, str], sample: Path, tmp_path: Path
-) -> None:
-    rows = {}
-    for axis, values in (("fusion", "gharm,max"), ("solver", None), ("global-features", None)):
-        output = tmp_path / axis
-        arguments = ["compare", str(sample / "query"), "--map", "room", "--axis", axis]
-        arguments += ["--output", str(output), "--server", doors[1], "--option", "matcher=ratio"]
-        with pytest.raises(SystemExit) as caught:
-            main([*arguments, *(() if values is None else ("--values", values))])
-        assert caught.value.code in (0, None)
-        rows[axis] = json.loads((output / "compare.json").read_bytes())["values"]
-    assert {axis: [row["value"] for row in found] for axis, found in rows.items()} == {
-        "fusion": ["gharm", "max"],
-        "solver": ["pycolmap", "poselib", "registration"],
-        "global-features": ["densevlad", "localvlad", "all"],
-    }
-    for row in (row for found in rows.values() for row in found):
-        assert row["refusal"] is None, row
-        assert row["figures"]["localized"] == 3
-        assert row["figures"]["recall"][0]["fraction"] == 1.0
-        assert row["size_bytes"] > 0
-
-
-def test_a_matcher_that_the_features_have_none_of_is_a_row_that_says_so(
-    doors: tuple[str, str], sample: Path, tmp_path: Path
-) -> None:
-    arguments = ["compare", str(sample / "query"), "--map", "room", "--axis", "matcher"]
-    with pytest.raises(SystemExit) as caught:
-        main([*arguments, "--output", str(tmp_path), "--server", doors[0]])
-
-    assert caught.value.code in (0, None)
-    values = json.loads((tmp_path / "compare.json").read_bytes())["values"]
-    assert [value["refusal"] is None for value in values] == [True, True, False]
-    assert values[2]["refusal"]["code"].startswith(("options.", "features.", "weights."))
-
-
 def test_all_modes_of_a_benchmark(
     doors: tuple[str, str], queries: list[Any], tmp_path: Path
 ) -> None:
