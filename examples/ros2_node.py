@@ -19,7 +19,7 @@ from tf2_ros import Buffer, TransformBroadcaster, TransformException, TransformL
 from clients import Axes, Client, blended, session_from_map
 from visloc.errors import VislocError
 from visloc.geometry import Pose
-from visloc.rosbag import camera_from_info
+from visloc_extensions.ros.cameras import camera_from_info
 
 
 class Localizer(Node):

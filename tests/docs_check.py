@@ -34,9 +34,6 @@ import numpy as np
 import typer
 from typer.core import TyperGroup
 
-from tests.rosbags_made import write_bag
-from visloc.kapture import read_dataset
-
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = (
     ROOT / "README.md",
@@ -159,7 +156,6 @@ RULES = (
     Rule(Tier.ELSEWHERE, r"", r"curl .*//maps\.example\.org", "a host of that name"),
     Rule(Tier.PARSED, r"", r"([A-Z]+=\S+ |[A-Z]+=\".*\" )?make ", "a target of its own"),
     Rule(Tier.PARSED, r"examples/plugin", r"", "needs it installed; tests/examples/test_plugin.py"),
-    Rule(Tier.PARSED, r"ar-and", r"(mapping import|localize bag)", "needs bags; test_rosbag.py"),
     Rule(Tier.PARSED, r"map-sets", r"mapping (set|split)", _PLACES),
     Rule(Tier.PARSED, r"capture/README", r"mapping capture", "the tutorial runs it"),
     Rule(Tier.PARSED, r"your-app", r"visloc-service .*cors", "test_web_overlay.py"),
@@ -504,7 +500,8 @@ def prepare(base: Path) -> None:
     call(base, ["mapping", "build", "small/mapping", "--map", "kitchen"])
     call(base, ["mapping", "build", "small/query", "--map", "hall", "--method", "sfm"])
     call(base, [sys.executable, str(ROOT / "examples" / "film.py")])
-    write_bag(base / "walk.bag", read_dataset(base / "small" / "mapping"), ros1=True)
+    for script in sorted(ROOT.glob("visloc_extensions/*/tests/prepare_docs.py")):
+        call(base, [sys.executable, str(script)])
 
 
 def copy_renamed(source: Path, target: Path) -> None:
@@ -538,8 +535,8 @@ def desk_of(base: Path, page: str) -> Desk:
         links["lund_door"] = DATA / "import_samples" / "lund_door"
     for name, target in links.items():
         (folder / name).symlink_to(target)
-    for name in ("walk.mp4", "photo.jpg", "walk.bag"):
-        shutil.copy(base / name, folder)
+    for file in (path for path in base.iterdir() if path.is_file()):
+        shutil.copy(file, folder)
     recording = folder / "RECORDING"
     recording.mkdir()
     shutil.copy(folder / ".demo" / "photo.jpg", recording)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Set
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +11,8 @@ import PIL.Image
 import pycolmap
 import pytest
 
-from clients.evaluation.pose_files import of_photos, read_poses
 from clients.evaluation.queries import read_queries
-from clients.evaluation.results import read_results, write_poses
-from clients.evaluation.scoring import read_conditions
+from clients.evaluation.results import read_results
 from mapping.importers import import_dataset
 from mapping.importers.colmap import read as read_colmap
 from mapping.importers.dataset import write_imported
@@ -55,6 +53,7 @@ NAMES = [
     *("a\\b.jpg", "./a.jpg", "C:a.jpg", "x.overlapping/y.jpg", "PINHOLE.jpg", "a PINHOLE 1.jpg"),
     *("a.jpg 1 0 0 0 0 0 0", "x" * 200 + ".jpg"),
 ]
+Through = Callable[[Path, str], list[str]]
 POSE = Pose(np.eye(3), np.array([1.0, 2.0, 3.0]))
 CAMERA = Camera("PINHOLE", 64, 48, (50.0, 50.0, 32.0, 24.0))
 OTHER = "other.jpg"
@@ -95,13 +94,6 @@ def pairs(folder: Path, name: str) -> list[str]:
     return [first.first, first.second]
 
 
-def poses(folder: Path, name: str) -> list[str]:
-    write_poses(folder / "poses.txt", [(name, POSE), (OTHER, POSE)])
-    found, unknown = of_photos(read_poses(folder / "poses.txt"), [OTHER, name])
-    assert unknown == 0
-    return list(found)
-
-
 def results(folder: Path, name: str) -> list[str]:
     lines = [{"name": each, "status": "not_localized", "retrieved": []} for each in (name, OTHER)]
     path = folder / "results.jsonl"
@@ -127,11 +119,6 @@ def listed(folder: Path, name: str, camera: str) -> list[str]:
     found = read_queries(folder / "list.txt").photos
     assert [query.camera for query in found] == [CAMERA if camera else None] * 2
     return [query.name for query in found]
-
-
-def conditions(folder: Path, name: str) -> list[str]:
-    (folder / "of.txt").write_text(f"# by hand\n./{name}, night\n{OTHER}, night\n", "utf-8")
-    return read_conditions([], folder / "of.txt").split([name.replace("\\", "/"), OTHER])["night"]
 
 
 def colmap_model(folder: Path, name: str) -> list[str]:
@@ -178,31 +165,25 @@ def imported(folder: Path, name: str) -> list[str]:
     return [record.path for record in read_dataset(folder / "out").images]
 
 
-FILES: list[Callable[[Path, str], list[str]]] = [
-    *(dataset, observations, features, matches, pairs, poses, results, bare_list),
-    *(list_with_cameras, conditions, colmap_model, colmap_text, transforms, imported),
+FILES: list[Through] = [
+    *(dataset, observations, features, matches, pairs, results, bare_list, list_with_cameras),
+    *(colmap_model, colmap_text, transforms, imported),
 ]
 # What people or other programs write, with the characters that end a name there.
-BREAKS = set("\n\r\t")
-BY_HAND = {
-    bare_list: BREAKS,
-    list_with_cameras: BREAKS,
-    colmap_text: BREAKS,
-    conditions: {*BREAKS, ",", "\x85"},
-}
+BREAKS = frozenset("\n\r\t")
+BY_HAND = (bare_list, list_with_cameras, colmap_text)
+FINE = ["#a.jpg", "a b.jpg", "a;b.jpg", '"a".jpg', "a%20b.jpg", "%23a.jpg", "-x.jpg", "\u00e9.jpg"]
 
 
-@pytest.mark.parametrize("through", FILES, ids=lambda through: through.__name__)
-def test_names_come_back_or_are_refused_by_name(
-    tmp_path: Path, through: Callable[[Path, str], list[str]]
-) -> None:
+def check_names(through: Through, tmp_path: Path, breaks: Set[str] = frozenset()) -> None:
+    """Give a file all names but those that nobody can write by hand, with these characters."""
     refused = []
     wrong = {}
     for number, name in enumerate(NAMES):
-        if through in BY_HAND and (name != name.strip() or not BY_HAND[through].isdisjoint(name)):
-            continue  # nobody can write it in such a line
+        if breaks and (name != name.strip() or not breaks.isdisjoint(name)):
+            continue
         folder = tmp_path / str(number)
-        folder.mkdir()
+        folder.mkdir(parents=True)
         try:
             back = through(folder, name)
         except VislocError as error:
@@ -220,7 +201,9 @@ def test_names_come_back_or_are_refused_by_name(
     assert not {name for name in refused if name.isprintable() and "," not in name} & set(FINE)
 
 
-FINE = ["#a.jpg", "a b.jpg", "a;b.jpg", '"a".jpg', "a%20b.jpg", "%23a.jpg", "-x.jpg", "\u00e9.jpg"]
+@pytest.mark.parametrize("through", FILES, ids=lambda through: through.__name__)
+def test_names_come_back_or_are_refused_by_name(tmp_path: Path, through: Through) -> None:
+    check_names(through, tmp_path, BREAKS if through in BY_HAND else frozenset())
 
 
 def test_names_that_differ_in_one_sign_only_are_kept_apart(tmp_path: Path) -> None:
@@ -230,33 +213,3 @@ def test_names_that_differ_in_one_sign_only_are_kept_apart(tmp_path: Path) -> No
             folder = tmp_path / f"{through.__name__} {number}"
             folder.mkdir()
             assert through(folder, name) == [name, OTHER]
-    at = [Pose(np.eye(3), np.array([float(row), 0, 0])) for row in range(len(names))]
-    write_poses(tmp_path / "poses.txt", zip(names, at, strict=True))
-    with pytest.raises(VislocError, match=r"a%20b\.jpg") as caught:
-        of_photos(read_poses(tmp_path / "poses.txt"), names)
-    assert caught.value.code == "poses.ambiguous"
-    del names[1], at[1]
-    write_poses(tmp_path / "poses.txt", zip(names, at, strict=True))
-    found, _ = of_photos(read_poses(tmp_path / "poses.txt"), names)
-    assert {name: known.pose.translation[0] for name, known in found.items()} == {
-        name: pose.translation[0] for name, pose in zip(names, at, strict=True)
-    }
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "#a.jpg 1 0 0 0 1 2 3\n",
-        "%23a.jpg 1 0 0 0 1 2 3\n",
-        "# name qw qx qy qz tx ty tz\n#a.jpg 1 0 0 0 1 2 3\n",
-    ],
-)
-def test_poses_of_other_tools_of_names_that_begin_like_comments_are_read(
-    tmp_path: Path, text: str
-) -> None:
-    (tmp_path / "poses.txt").write_text(text)
-    found, unknown = of_photos(read_poses(tmp_path / "poses.txt"), ["#a.jpg", "b.jpg"])
-    assert list(found) == ["#a.jpg"]
-    assert unknown == 0
-    commented, unknown = of_photos(read_poses(tmp_path / "poses.txt"), ["a.jpg", "b.jpg"])
-    assert (commented, unknown) == ({}, int(text.startswith("%")))

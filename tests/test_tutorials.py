@@ -16,8 +16,6 @@ from mapping.pipeline.build import build_map
 from mapping.pipeline.settings import BuildSettings
 from mapping.sample import write_sample
 from tests import docs_check
-from tests.rosbags_made import write_bag
-from visloc.kapture import read_dataset
 
 # How many commands run; your-room takes minutes more, and has its own test.
 TUTORIALS = {
@@ -26,7 +24,7 @@ TUTORIALS = {
     "compare-features": 8,
     "for-others": 12,
     "from-hloc": 5,
-    "robot": 6,
+    "robot": 4,
     "your-app": 4,
 }
 WITHOUT_COMMANDS = "from-hosted"
@@ -83,24 +81,19 @@ def test_an_output_is_compared_but_for_its_numbers(line: str, printed: str, is_l
     assert bool(re.search(like(line), printed)) is is_like
 
 
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in TUTORIALS],
-)
-def test_the_commands_of_a_tutorial_run(name: str, demo: Path, tmp_path: Path) -> None:
-    commands = docs_check.commands_of(docs_check.ROOT / "docs" / "tutorials" / f"{name}.md")
+def run_page(page: Path, count: int, demo: Path, folder: Path) -> None:
+    """Run the commands of a page, of which so many run, beside what the demo leaves."""
+    commands = docs_check.commands_of(page)
     if any(command.text.startswith("npm ") for command in commands):
         if shutil.which("npm") is None:
             pytest.skip("needs Node.js: `npm` on PATH")
         if not (docs_check.ROOT / "web" / "client" / "dist").is_dir():
             pytest.skip("needs the built client, which `make page` makes")
-    shutil.copytree(demo, tmp_path / ".demo")
-    (tmp_path / ".venv").symlink_to(Path(sys.executable).parents[1])
-    for folder in ("examples", "web"):
-        (tmp_path / folder).symlink_to(docs_check.ROOT / folder)
-    if name == "robot":
-        write_bag(tmp_path / "walk.bag", read_dataset(demo / "dataset" / "mapping"), ros1=True)
-    desk, did = docs_check.Desk(tmp_path), []
+    shutil.copytree(demo, folder / ".demo")
+    (folder / ".venv").symlink_to(Path(sys.executable).parents[1])
+    for name in ("examples", "web"):
+        (folder / name).symlink_to(docs_check.ROOT / name)
+    desk, did = docs_check.Desk(folder), []
     try:
         for command in commands:
             what, problem = docs_check.checked(command, desk)
@@ -110,7 +103,16 @@ def test_the_commands_of_a_tutorial_run(name: str, demo: Path, tmp_path: Path) -
             did.append(what)
     finally:
         desk.close()
-    assert did.count("run") == TUTORIALS[name]
+    assert did.count("run") == count
     printed = " ".join(desk.printed.split())
-    for line in shown(docs_check.ROOT / "docs" / "tutorials" / f"{name}.md"):
+    for line in shown(page):
         assert re.search(like(line), printed), line
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in TUTORIALS],
+)
+def test_the_commands_of_a_tutorial_run(name: str, demo: Path, tmp_path: Path) -> None:
+    page = docs_check.ROOT / "docs" / "tutorials" / f"{name}.md"
+    run_page(page, TUTORIALS[name], demo, tmp_path)

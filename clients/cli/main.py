@@ -11,14 +11,10 @@ from typing import Annotated, NoReturn
 import typer
 from rich.console import Console
 
-from clients.cli.bag import bag
-from clients.cli.compare import compare
 from clients.cli.dataset import benchmark, localize_batch
 from clients.cli.display import print_line, print_result
-from clients.cli.evaluate import evaluate, submit
 from clients.cli.maps import maps_app
 from clients.cli.options import Connection, MapRef, QueryOptions, priors_from_text, spread
-from clients.cli.retrieve import retrieve
 from clients.errors import not_understood
 from clients.evaluation.results import check_can_be_written, write_whole
 from clients.wire.requests import read_image
@@ -44,7 +40,7 @@ _err = Console(stderr=True)
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command and exit; errors are one line, not a traceback."""
     try:
-        # compare writes down how it was called.
+        # Commands may write down how they were called.
         app(arguments, obj=tuple(sys.argv[1:] if arguments is None else arguments))
     except VislocError as error:
         _fail(error.code, str(error))
@@ -121,11 +117,6 @@ def image(
 app.command("batch")(localize_batch)
 app.command()(benchmark)
 app.add_typer(maps_app, name="maps")
-app.command()(compare)
-app.command()(bag)
-app.command()(evaluate)
-app.command()(submit)
-app.command()(retrieve)
 for _name, _entry in extensions(LOCALIZE_COMMANDS).items():
     app.command(_name)(load(_entry))
 

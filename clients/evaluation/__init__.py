@@ -1,1 +1,1 @@
-"""Many queries: batches, benchmarks, comparisons."""
+"""Many queries: batches and benchmarks."""

@@ -42,7 +42,6 @@ IMPORTERS: Mapping[str, tuple[str, str]] = {
     "colmap": ("mapping.importers.colmap", "read"),
     "images": ("mapping.importers.images", "read"),
     "nerfstudio": ("mapping.importers.nerfstudio", "read"),
-    "rosbag": ("mapping.importers.rosbag", "read"),
 }
 
 
@@ -136,15 +135,15 @@ def read_model(
     """
     if name not in importer_names():
         raise refuse("import.unknown_format", field="FORMAT", expected=importer_names(), got=name)
-    # That of a bag is written.
-    if photos is not None and not photos.is_dir() and (name != "rosbag" or photos.exists()):
-        raise refuse("import.photos", field="--photos", got=str(photos))
     read: Callable[..., ImportedModel]
     if name in IMPORTERS:
         module, function = IMPORTERS[name]
         read = getattr(import_module(module), function)
     else:
         read = load(extensions(extension_points.IMPORTERS)[name])
+    makes_photos = getattr(read, "makes_photos", False)  # a reader that writes them
+    if photos is not None and not photos.is_dir() and (not makes_photos or photos.exists()):
+        raise refuse("import.photos", field="--photos", got=str(photos))
     if name == "images":  # the only one that decodes photos, which takes long
         return read(path, photos, partial(progress, "photos"))
     with one_step(progress, "reading"):

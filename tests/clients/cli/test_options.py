@@ -50,14 +50,14 @@ def commands() -> dict[str, Any]:
     return {**command.commands, **command.commands["maps"].commands}
 
 
-@pytest.mark.parametrize("name", ["image", "batch", "benchmark", "compare", "list", "push", "use"])
+@pytest.mark.parametrize("name", ["image", "batch", "benchmark", "list", "push", "use"])
 def test_every_command_that_asks_a_server_has_all_options_of_the_connection(name: str) -> None:
     names = [parameter.name for parameter in commands()[name].params]
 
     assert {each.name for each in fields(Connection)} <= set(names)
-    if name in ("image", "batch", "benchmark", "compare"):
+    if name in ("image", "batch", "benchmark"):
         assert {each.name for each in fields(QueryOptions)} <= set(names)
-    if name in ("batch", "benchmark", "compare"):
+    if name in ("batch", "benchmark"):
         assert {each.name for each in fields(Photos)} <= set(names)
     assert len(set(names)) == len(names)
 

@@ -9,9 +9,9 @@ import h5py
 import numpy as np
 import pytest
 
-from clients.evaluation.pose_files import read_poses
-from clients.evaluation.scoring import read_conditions
 from tests.mapping.importers.every_field import Read, check_lines, told
+from visloc_extensions.research.evaluation.pose_files import read_poses
+from visloc_extensions.research.evaluation.scoring import read_conditions
 from visloc_extensions.research.hloc import import_features
 
 # The files of each format, those whose lines are changed first; and what reads them.

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from clients.cli.main import main
-from clients.evaluation.pose_files import read_poses
-from clients.evaluation.submission import Benchmark, make_submission
 from visloc.errors import DatasetError
+from visloc_extensions.research.evaluation.pose_files import read_poses
+from visloc_extensions.research.evaluation.submission import Benchmark, make_submission
 
 HERE = {"rotation_wxyz": [1.0, 0.0, 0.0, 0.0], "translation": [1.0, 2.0, 3.0]}
 # The canned service retrieves seq/1.jpg first.

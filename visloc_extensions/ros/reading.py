@@ -11,9 +11,9 @@ from typing import Any
 
 from visloc.errors import InvalidInput, VislocError, refuse
 from visloc.geometry import Camera, Pose
-from visloc.rosbag.cameras import camera_from_info, is_cropped
-from visloc.rosbag.pictures import Picture, has_known_colors, is_depth, pixels_of
-from visloc.rosbag.transforms import Transforms
+from visloc_extensions.ros.cameras import camera_from_info, is_cropped
+from visloc_extensions.ros.pictures import Picture, has_known_colors, is_depth, pixels_of
+from visloc_extensions.ros.transforms import Transforms
 
 _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _INFO, _TF = "sensor_msgs/msg/CameraInfo", "tf2_msgs/msg/TFMessage"

@@ -12,9 +12,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from clients.cli.main import main
-from clients.evaluation.pose_files import of_photos, read_poses
-from clients.evaluation.scoring import read_conditions
+from clients.evaluation.pairs import of_photos
 from visloc.errors import DatasetError, InvalidInput
+from visloc_extensions.research.evaluation.pose_files import read_poses
+from visloc_extensions.research.evaluation.scoring import read_conditions
 
 Lines = dict[str, list[float]]
 BINS = ((0.05, 5.0), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))

@@ -19,9 +19,11 @@ from clients.evaluation.results import check_can_be_written
 from clients.evaluation.run import ask_patiently, raise_unless_of_one
 from visloc.errors import VislocError, refuse
 from visloc.geometry import Pose, propagated
-from visloc.rosbag import Bag, Picture, PoseStamped, open_bag, write_poses
 from visloc_api.words.options import LocalizeOptions
 from visloc_api.words.poses import PoseEstimate
+from visloc_extensions.ros.pictures import Picture
+from visloc_extensions.ros.reading import Bag, open_bag
+from visloc_extensions.ros.writing import PoseStamped, write_poses
 
 _err = Console(stderr=True)
 

@@ -7,24 +7,33 @@ import shlex
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import typer
 
 from clients import AsyncClient
-from clients.cli import compare as compare_cli
-from clients.cli.compare_display import command_text, markdown_of
-from clients.cli.compare_plot import draw_comparison
-from clients.cli.main import main
-from clients.evaluation.compare import DEFAULT_VALUES, Axis, make_variants, parse_values
+from clients.cli.main import app, main
+from clients.cli.options import Connection, Photos, QueryOptions
 from clients.wire.answers import LocalizeResult
+from tests.test_public_surface import modules_after
 from visloc.errors import InvalidInput, Unavailable
 from visloc.options import Extraction, Fusion, Matcher, Solver
 from visloc.options import LocalizeOptions as CoreOptions
 from visloc_api.words.maps import MapInfo
 from visloc_api.words.options import LocalizeOptions
+from visloc_extensions.research.cli import compare as compare_cli
+from visloc_extensions.research.cli.compare_display import command_text, markdown_of
+from visloc_extensions.research.cli.compare_plot import draw_comparison
+from visloc_extensions.research.evaluation.compare import (
+    DEFAULT_VALUES,
+    Axis,
+    make_variants,
+    parse_values,
+)
 
 Dataset = Callable[..., Path]
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -506,3 +515,57 @@ def test_a_long_command_is_broken_before_options() -> None:
     assert text.count(" \\\n") > 1
     assert all(len(line) < 110 for line in text.splitlines())
     assert shlex.split(text.replace("\\\n", "")) == ["localize", *arguments]
+
+
+def test_the_usual_values_of_an_axis_are_compared(
+    doors: tuple[str, str], sample: Path, tmp_path: Path
+) -> None:
+    rows = {}
+    for axis, values in (("fusion", "gharm,max"), ("solver", None), ("global-features", None)):
+        output = tmp_path / axis
+        arguments = ["compare", str(sample / "query"), "--map", "room", "--axis", axis]
+        arguments += ["--output", str(output), "--server", doors[1], "--option", "matcher=ratio"]
+        with pytest.raises(SystemExit) as caught:
+            main([*arguments, *(() if values is None else ("--values", values))])
+        assert caught.value.code in (0, None)
+        rows[axis] = json.loads((output / "compare.json").read_bytes())["values"]
+    assert {axis: [row["value"] for row in found] for axis, found in rows.items()} == {
+        "fusion": ["gharm", "max"],
+        "solver": ["pycolmap", "poselib", "registration"],
+        "global-features": ["densevlad", "localvlad", "all"],
+    }
+    for row in (row for found in rows.values() for row in found):
+        assert row["refusal"] is None, row
+        assert row["figures"]["localized"] == 3
+        assert row["figures"]["recall"][0]["fraction"] == 1.0
+        assert row["size_bytes"] > 0
+
+
+def test_a_matcher_that_the_features_have_none_of_is_a_row_that_says_so(
+    doors: tuple[str, str], sample: Path, tmp_path: Path
+) -> None:
+    arguments = ["compare", str(sample / "query"), "--map", "room", "--axis", "matcher"]
+    with pytest.raises(SystemExit) as caught:
+        main([*arguments, "--output", str(tmp_path), "--server", doors[0]])
+
+    assert caught.value.code in (0, None)
+    values = json.loads((tmp_path / "compare.json").read_bytes())["values"]
+    assert [value["refusal"] is None for value in values] == [True, True, False]
+    assert values[2]["refusal"]["code"].startswith(("options.", "features.", "weights."))
+
+
+def test_compare_has_all_options_of_the_connection_the_query_and_the_photos() -> None:
+    command: Any = typer.main.get_command(app)
+    names = [parameter.name for parameter in command.commands["compare"].params]
+    assert {each.name for kind in (Connection, QueryOptions, Photos) for each in fields(kind)} <= {
+        *names
+    }
+    assert len(set(names)) == len(names)
+
+
+def test_the_commands_that_ask_a_server_load_nothing_heavy() -> None:
+    names = (
+        f"visloc_extensions.research.cli.{name}" for name in ("compare", "evaluate", "retrieve")
+    )
+    loaded = modules_after(f"import {', '.join(names)}")
+    assert not loaded & {"torch", "cv2", "pycolmap", "PIL", "scipy", "safetensors"}

@@ -28,7 +28,8 @@ from visloc.errors import DatasetError, refuse
 from visloc.geometry import Camera, Pose
 from visloc.kapture import Sensor
 from visloc.kapture.dataset import UNKNOWN_CAMERA
-from visloc.rosbag import Bag, Picture, depth_in_metres, open_bag
+from visloc_extensions.ros.pictures import Picture, depth_in_metres
+from visloc_extensions.ros.reading import Bag, open_bag
 
 # Without poses, a photo is taken when so long has passed since the last one.
 _STEP_NS = 500_000_000
@@ -86,6 +87,9 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
             if is_new:
                 shutil.rmtree(folder, ignore_errors=True)
             raise
+
+
+read.makes_photos = True  # type: ignore[attr-defined]  # their folder need not exist
 
 
 def _read(bag: Bag, folder: Path) -> ImportedModel:

@@ -10,11 +10,12 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-from clients.evaluation.pose_files import KnownPose, of_photos, read_poses
+from clients.evaluation.pairs import of_photos
 from visloc.accuracy import Compared, accuracy_of
 from visloc.errors import refuse
 from visloc.evaluation import Threshold
 from visloc.kapture.text import plain_name
+from visloc_extensions.research.evaluation.pose_files import KnownPose, read_poses
 
 _AVERAGED = (
     *("median_position_error_m", "median_orientation_error_deg"),

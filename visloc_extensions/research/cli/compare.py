@@ -12,7 +12,6 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from clients.cli.compare_display import command_text, markdown_of, print_comparison
 from clients.cli.display import print_failed
 from clients.cli.options import (
     Connection,
@@ -23,7 +22,16 @@ from clients.cli.options import (
     thresholds_of,
 )
 from clients.cli.progress import run_with_progress
-from clients.evaluation.compare import (
+from clients.evaluation.readers import Reader, takes_features
+from clients.evaluation.results import check_can_be_written, write_whole
+from visloc.errors import refuse
+from visloc_api.words.maps import MapInfo
+from visloc_extensions.research.cli.compare_display import (
+    command_text,
+    markdown_of,
+    print_comparison,
+)
+from visloc_extensions.research.evaluation.compare import (
     DEFAULT_VALUES,
     Asked,
     Axis,
@@ -32,10 +40,6 @@ from clients.evaluation.compare import (
     make_variants,
     parse_values,
 )
-from clients.evaluation.readers import Reader, takes_features
-from clients.evaluation.results import check_can_be_written, write_whole
-from visloc.errors import refuse
-from visloc_api.words.maps import MapInfo
 
 _out = Console()
 _err = Console(stderr=True)
@@ -159,6 +163,6 @@ def _drawing() -> Callable[[Mapping[str, Any]], bytes]:
     """
     if importlib.util.find_spec("matplotlib") is None:
         raise refuse("compare.matplotlib")
-    from clients.cli.compare_plot import draw_comparison
+    from visloc_extensions.research.cli.compare_plot import draw_comparison
 
     return draw_comparison

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated
 
@@ -12,10 +12,9 @@ from rich.console import Console
 from clients.cli.display import print_failed
 from clients.cli.options import Connection, MapRef, Photos, QueryOptions, spread
 from clients.cli.progress import run_with_progress
-from clients.evaluation.pairs import write_query_pairs
 from clients.evaluation.results import check_can_be_written
 from clients.evaluation.run import Outcome, QueryClient, localize_all
-from visloc.kapture.pairs import check_pair_names
+from visloc.kapture.pairs import check_pair_names, write_pair_rows
 
 _out = Console()
 _err = Console(stderr=True)
@@ -60,3 +59,19 @@ def retrieve(
     num_pairs = write_query_pairs(output, outcomes)
     _out.print(f"{num_pairs} pairs of {len(queries)} photos", highlight=False)
     print_failed(_err, [outcome for outcome in outcomes if outcome.error is not None])
+
+
+def write_query_pairs(path: Path, outcomes: Iterable[Outcome]) -> int:
+    """Write the mapping photos that each answer was matched with, best first.
+
+    Returns:
+        How many pairs were written.
+    """
+    rows = [
+        (outcome.query.name, image.image, image.score)
+        for outcome in outcomes
+        if outcome.result is not None
+        for image in outcome.result.retrieved
+    ]
+    write_pair_rows(path, rows)
+    return len(rows)

@@ -11,13 +11,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.rosbags_made import SECOND, Made, write_messages
 from visloc.errors import Conflict, DatasetError
 from visloc.geometry import Camera, Pose
 from visloc.pose.reprojection import project
-from visloc.rosbag import Picture, PoseStamped, Transforms, camera_from_info, open_bag, write_poses
-from visloc.rosbag.pictures import depth_in_metres, pixels_of
-from visloc.rosbag.writing import ros_covariance
+from visloc_extensions.ros.cameras import camera_from_info
+from visloc_extensions.ros.pictures import Picture, depth_in_metres, pixels_of
+from visloc_extensions.ros.reading import open_bag
+from visloc_extensions.ros.tests.rosbags_made import SECOND, Made, write_messages
+from visloc_extensions.ros.transforms import Transforms
+from visloc_extensions.ros.writing import PoseStamped, ros_covariance, write_poses
 
 numbers = st.floats(-9, 9)
 quaternions = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q) > 0.1)

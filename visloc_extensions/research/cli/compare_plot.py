@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from clients.cli.compare_display import clean, mebibytes, threshold_text
+from visloc_extensions.research.cli.compare_display import clean, mebibytes, threshold_text
 
 _WIDTH_INCHES = 11.0
 _BAR_INCHES = 0.17  # the height of one bar

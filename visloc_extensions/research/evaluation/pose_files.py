@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
-from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +14,6 @@ from visloc.errors import DatasetError, InvalidInput, refuse
 from visloc.geometry import Pose
 from visloc.kapture import read_dataset
 
-_T = TypeVar("_T")
 _RESULTS = "results.jsonl"
 
 
@@ -55,46 +51,6 @@ def read_poses(path: Path) -> dict[str, KnownPose]:
     if not path.is_file():
         raise refuse("poses.missing", field=str(path))
     return dict(_of_results(path)) if path.suffix == ".jsonl" else _of_text(path)
-
-
-def of_photos(found: Mapping[str, _T], photos: Iterable[str]) -> tuple[dict[str, _T], int]:
-    """Find the photos that the names of a file stand for.
-
-    A name stands for the photo of that name. Otherwise it stands for the photo whose path ends
-    with it, as visuallocalization.net has base names for some data sets.
-
-    Returns:
-        The values by the photos' names, and the number of names that stand for no photo; those that
-        begin with ``#``, as comments do, aside.
-
-    Raises:
-        DatasetError: ``poses.ambiguous`` when a name ends the paths of several photos, or is that
-            of one as it stands and of another decoded; ``poses.duplicate`` when two names stand
-            for one photo.
-    """
-    photos = list(photos)
-    exact = set(photos)
-    ending: dict[str, list[str]] = defaultdict(list)
-    for photo in photos:
-        parts = photo.split("/")
-        for start in range(1, len(parts)):
-            ending["/".join(parts[start:])].append(photo)
-    values: dict[str, _T] = {}
-    unknown = 0
-    for name, value in found.items():
-        # Our own files write a blank as %20; other tools' files do not decode names.
-        spellings = dict.fromkeys((name, unquote(name)))
-        known = [each for each in spellings if each in exact]
-        fits = known or next((ending[each] for each in spellings if each in ending), [])
-        if len(fits) > 1:
-            raise refuse("poses.ambiguous", field=name, got=", ".join(fits[:3]))
-        if not fits:
-            unknown += not name.startswith("#")
-        elif fits[0] in values:
-            raise refuse("poses.duplicate", field=name, got=fits[0])
-        else:
-            values[fits[0]] = value
-    return values, unknown
 
 
 def _of_results(path: Path) -> Iterator[tuple[str, KnownPose]]:

@@ -15,11 +15,11 @@ from enum import StrEnum
 from pathlib import Path
 
 from clients.evaluation.filling import estimate_of
-from clients.evaluation.pose_files import KnownPose
 from clients.evaluation.results import StoredResult, read_results
 from visloc.errors import refuse
 from visloc.geometry import Pose
 from visloc_api.words.poses import PoseEstimate
+from visloc_extensions.research.evaluation.pose_files import KnownPose
 
 
 class Benchmark(StrEnum):

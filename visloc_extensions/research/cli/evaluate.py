@@ -13,14 +13,14 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from clients.cli.compare_display import clean
 from clients.cli.display import print_line
 from clients.cli.options import Thresholds, thresholds_of
-from clients.evaluation.pose_files import read_poses
 from clients.evaluation.results import check_can_be_written, write_poses, write_whole
-from clients.evaluation.scoring import read_conditions, read_scene, score
-from clients.evaluation.submission import Benchmark, make_submission
 from visloc.errors import refuse
+from visloc_extensions.research.cli.compare_display import clean
+from visloc_extensions.research.evaluation.pose_files import read_poses
+from visloc_extensions.research.evaluation.scoring import read_conditions, read_scene, score
+from visloc_extensions.research.evaluation.submission import Benchmark, make_submission
 
 _out = Console()
 

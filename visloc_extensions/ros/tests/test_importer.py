@@ -12,10 +12,10 @@ import pytest
 
 from mapping.importers import import_dataset, read_model
 from mapping.stages.depth import read_depth
-from tests.rosbags_made import SECOND, Made, write_bag, write_messages
 from visloc.errors import DatasetError, InvalidInput
 from visloc.geometry import Camera, Pose
 from visloc.kapture import Dataset, FileRecord, read_dataset
+from visloc_extensions.ros.tests.rosbags_made import SECOND, Made, write_bag, write_messages
 
 
 def of_first_camera(dataset: Dataset) -> list[FileRecord]:

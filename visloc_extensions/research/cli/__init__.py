@@ -1,0 +1,1 @@
+"""Commands of ``localize``, which asks a service: they load nothing heavy."""

@@ -1,0 +1,1 @@
+"""What these commands compare and score."""
