@@ -41,8 +41,6 @@ __all__ = [
 
 # name -> module and function (weights_dir, inference, threads) -> extractor.
 LOCAL_FEATURES: Mapping[str, tuple[str, str]] = {
-    "aliked": ("visloc.features.networks.aliked.load", "load_aliked"),
-    "aliked-t16": ("visloc.features.networks.aliked.load", "load_aliked_t16"),
     "faster2d2": ("visloc.features.networks.r2d2.load", "load_faster2d2"),
     "r2d2": ("visloc.features.networks.r2d2.load", "load_r2d2"),
     "sift": ("visloc.features.local.sift", "load_sift"),

@@ -14,6 +14,7 @@ import pytest
 from tests.mapping.importers.conftest import panned, texture
 from visloc.archive import MapStore
 from visloc.errors import Conflict, InvalidInput, Unavailable, WeightsError
+from visloc.features import GLOBAL_FEATURES
 from visloc.kapture import read_dataset
 from visloc_extensions.capture import job
 from visloc_extensions.capture.job import capture_map
@@ -135,11 +136,13 @@ def test_a_map_of_unknown_size_is_in_doubt_where_one_in_metres_is_in_use(
 
 @pytest.mark.parametrize("missing", ["local_features", "global_features"])
 def test_missing_weights_are_refused_before_anything_is_read(
-    make_video: Callable[..., Path], tmp_path: Path, missing: str
+    make_video: Callable[..., Path], tmp_path: Path, missing: str, monkeypatch: Any
 ) -> None:
     maps = tmp_path / "maps"
+    of_r2d2 = ("visloc.features.networks.r2d2.load", "load_r2d2")  # whose weights are missing
+    monkeypatch.setitem(GLOBAL_FEATURES, "weighted", of_r2d2)
     settings = CaptureSettings([make_video(panned(20, 12))], "room", maps)
-    without = {"local_features": "r2d2", "global_features": ("netvlad",)}
+    without = {"local_features": "r2d2", "global_features": ("weighted",)}
     with pytest.raises(WeightsError) as refused:
         capture_map(replace(settings, **{missing: without[missing]}), quiet, quiet)
     assert refused.value.code == "weights.missing"

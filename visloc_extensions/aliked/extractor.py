@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from visloc.features.base import Fingerprint
-from visloc.features.networks.aliked.model import Architecture, Padding
 from visloc.options import Extraction
 from visloc.types import LocalFeatures
+from visloc_extensions.aliked.model import Architecture, Padding
 
 MAX_LONG_SIDE_PX = 1280
 MIN_SCORE = 0.2  # of the paper, as are the radius and the temperature

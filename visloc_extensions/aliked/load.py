@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from visloc.features.base import LocalFeatureExtractor
-from visloc.features.networks.aliked.extractor import AlikedExtractor
-from visloc.features.networks.aliked.model import N16, T16, Architecture, read_network
-from visloc.features.networks.aliked.torch import TorchNetwork
 from visloc.options import Inference
+from visloc_extensions.aliked.extractor import AlikedExtractor
+from visloc_extensions.aliked.model import N16, T16, Architecture, read_network
+from visloc_extensions.aliked.torch import TorchNetwork
 
 
 def load_aliked(

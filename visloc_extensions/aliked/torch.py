@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from visloc.features.backends.torch import computed_with
-from visloc.features.networks.aliked.extractor import Seen, padded, padding_of
-from visloc.features.networks.aliked.model import AlikedNetwork, Padding
 from visloc.runtime.device import torch_device
+from visloc_extensions.aliked.extractor import Seen, padded, padding_of
+from visloc_extensions.aliked.model import AlikedNetwork, Padding
 
 _KEYPOINTS_AT_ONCE = 4096  # bounds the memory that their samples take
 

@@ -16,7 +16,9 @@ from torch import Tensor
 
 from visloc.errors import WeightsError
 from visloc.features.backends.torch import shapes_of
-from visloc.features.networks.aliked.extractor import (
+from visloc.features.weights.checkpoint import read_checkpoint
+from visloc.options import Inference
+from visloc_extensions.aliked.extractor import (
     AlikedExtractor,
     Seen,
     network_input,
@@ -24,8 +26,8 @@ from visloc.features.networks.aliked.extractor import (
     peaks,
     refined,
 )
-from visloc.features.networks.aliked.load import load_aliked, load_aliked_t16
-from visloc.features.networks.aliked.model import (
+from visloc_extensions.aliked.load import load_aliked, load_aliked_t16
+from visloc_extensions.aliked.model import (
     N16,
     T16,
     AlikedNetwork,
@@ -33,9 +35,7 @@ from visloc.features.networks.aliked.model import (
     deformable_convolution,
     read_network,
 )
-from visloc.features.networks.aliked.torch import TorchNetwork
-from visloc.features.weights.checkpoint import read_checkpoint
-from visloc.options import Inference
+from visloc_extensions.aliked.torch import TorchNetwork
 
 ARCHITECTURES = {"aliked": N16, "aliked-t16": T16}
 LOADERS = {"aliked": load_aliked, "aliked-t16": load_aliked_t16}

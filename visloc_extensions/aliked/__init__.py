@@ -1,0 +1,1 @@
+"""Adds the local features ``aliked`` and ``aliked-t16``: ALIKED, by torch."""
