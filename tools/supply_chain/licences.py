@@ -27,9 +27,9 @@ _EXTRAS = (
 _HEADER = """# Licences
 
 What the project depends on, by what each package says of itself or the
-[policy](../tools/supply_chain/policy.toml) knows of it. `make licences` writes this page; `make check`
-fails when it is out of date, or when the policy does not allow a licence. visloc itself is under
-the [BSD 3-Clause license](../LICENSE).
+[policy](../tools/supply_chain/policy.toml) knows of it. `make licences` writes this page; `make
+check` fails when it is out of date, or when the policy does not allow a licence. visloc itself is
+under the [BSD 3-Clause license](../LICENSE).
 
 | package | version | licence | in the images |
 |---|---|---|---|
