@@ -29,9 +29,9 @@ from benchmarks.trust.scenarios import RIGHT, photos_of
 from mapping.own_test.trials import left_out_with
 from visloc.evaluation import pose_error
 from visloc.geometry import Pose
+from visloc.localization.acceptance.corrections import crowding, widening, with_redraws
 from visloc.localization.acceptance.gates import Problem, accepted
 from visloc.localization.acceptance.judge import TIE_ANGLE, TIE_REACH_SHARE
-from visloc.localization.acceptance.redraws import crowding, widening, with_redraws
 from visloc.localization.localizer import Localizer
 from visloc.localization.map_view.constraints import Constraints
 from visloc.options import LocalizeOptions

@@ -19,7 +19,7 @@ from service.engine.stores import open_store
 from service.grpc.server import GrpcServer
 from service.http.acceptor import Acceptor, OpenConnections, Patient
 from service.http.app import create_app
-from service.http.backend import Backend
+from service.http.envelope import Backend
 from service.http.health import metrics_app
 from service.http.slow_clients import Arrivals, http_protocol
 from service.security.access import open_access

@@ -38,7 +38,7 @@ from visloc.errors import (
 )
 from visloc.options import LocalizeOptions, ReadAs
 from visloc.priors import Priors
-from visloc.runtime.timing import summed
+from visloc.runtime.threads import summed
 from visloc.sets.choosing import (
     TileScore,
     allowed_tiles,

@@ -12,14 +12,15 @@ import grpc
 from service.grpc.calls import Handler, behaviour_of, handler_like
 from service.grpc.envelope import Context, Envelope
 from service.security.access import (
+    FORWARDED_HEADER,
     NOTHING,
     Access,
+    address_of_grpc,
     is_method,
     needed_over_grpc,
     tokens_of,
 )
 from service.security.key_file import Key
-from service.security.proxies import FORWARDED_HEADER, address_of_grpc
 from service.telemetry.logs import UNMATCHED
 from visloc.errors import Overloaded, VislocError, refuse
 

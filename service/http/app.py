@@ -11,8 +11,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 import visloc
 from service.http.access import add_access
-from service.http.backend import Backend, backend_of
-from service.http.envelope import PROBED_PATHS, RequestEnvelope
+from service.http.envelope import PROBED_PATHS, Backend, RequestEnvelope, backend_of
 from service.http.health import add_health_routes
 from service.http.localize import add_localize_routes
 from service.http.maps import add_map_routes

@@ -12,7 +12,7 @@ from starlette.requests import Request
 
 from service.api import jobs
 from service.api.parsing import ONE_BY_ONE
-from service.http.backend import backend_of
+from service.http.envelope import backend_of
 from service.http.forms import Form, FormLimits, parse_form
 from service.settings import REQUEST_OVERHEAD_BYTES, ServiceSettings
 from service.values import InstantJob, RigJob, SequenceJob

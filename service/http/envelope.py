@@ -1,23 +1,31 @@
-"""The outermost layer of the HTTP API: request ids, the log, and an answer to every request."""
+"""The outermost layer of the HTTP API: ids, the log, an answer to every request; what routes use."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
+from collections.abc import Callable
+from dataclasses import dataclass
 from http import HTTPStatus
 
 from starlette.datastructures import Headers, MutableHeaders
-from starlette.requests import ClientDisconnect
+from starlette.requests import ClientDisconnect, Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.api.deadlines import request_id
+from service.api.deadlines import TimeLimit, request_id, time_limit_of
+from service.engine.engine import Engine
 from service.errors import internal_error, stopping_error
-from service.http.backend import Backend
+from service.http.acceptor import OpenConnections
 from service.http.responses import problem_response
-from service.security.proxies import FORWARDED_HEADER
+from service.http.slow_clients import Arrivals
+from service.security.access import FORWARDED_HEADER, Access
+from service.settings import ServiceSettings
 from service.telemetry.logs import UNMATCHED, RequestRecord
+from service.telemetry.metrics import ServiceState
+from service.telemetry.observer import Observer
 from service.telemetry.tracing import traceparent_of
 from visloc.errors import VislocError, refuse
+from visloc_api.words.wire import TIMEOUT_HEADER
 
 logger = logging.getLogger(__name__)
 
@@ -114,3 +122,38 @@ def _busy() -> VislocError:
 
 def _ambiguous() -> VislocError:
     return refuse("request.framing", field="Transfer-Encoding")
+
+
+@dataclass(frozen=True, slots=True)
+class Backend:
+    """The parts of the service behind the HTTP API.
+
+    Attributes:
+        arrivals: the request bodies that are arriving.
+        connections: the open HTTP connections.
+        state: returns the current state of the service, for ``/metrics``.
+    """
+
+    engine: Engine
+    settings: ServiceSettings
+    observer: Observer
+    access: Access
+    arrivals: Arrivals
+    connections: OpenConnections
+    state: Callable[[], ServiceState]
+
+
+def backend_of(request: Request) -> Backend:
+    """Return the backend that ``create_app`` put into the state of the app."""
+    backend: Backend = request.app.state.backend
+    return backend
+
+
+def limit_of(request: Request) -> TimeLimit:
+    """Return the time that the request may take.
+
+    Raises:
+        InvalidInput: ``request.timeout``.
+    """
+    limit_s = backend_of(request).settings.request_timeout_s
+    return time_limit_of(request.headers.get(TIMEOUT_HEADER), limit_s)

@@ -11,7 +11,7 @@ from starlette.routing import Route
 
 import visloc
 from service.http.access import tokens_in
-from service.http.backend import Backend, backend_of
+from service.http.envelope import Backend, backend_of
 from service.http.responses import json_response
 from service.security.access import READ
 from visloc_api.words.status import Health, MapNotLoaded, Readiness

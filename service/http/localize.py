@@ -12,8 +12,8 @@ from fastapi import FastAPI, Request, Response
 from service.api.answers import instant_answer, localize_response
 from service.api.deadlines import TimeLimit, each_within, within
 from service.engine.engine import Engine
-from service.http.backend import backend_of, limit_of
 from service.http.bodies import read_localize_job, read_rig_job, read_sequence_jobs
+from service.http.envelope import backend_of, limit_of
 from service.http.openapi.app import problems
 from service.http.openapi.request_bodies import LOCALIZE_BODY, RIG_BODY, SEQUENCE_BODY
 from service.http.responses import Lines, json_response, while_connected

@@ -9,8 +9,8 @@ from typing import Annotated, Any
 from fastapi import FastAPI, Query, Request, Response
 
 from service.api.maps import map_info
-from service.http.backend import backend_of
 from service.http.bodies import checked_media_type, read_use_version
+from service.http.envelope import backend_of
 from service.http.openapi.app import problems
 from service.http.responses import json_response
 from visloc.errors import refuse

@@ -11,13 +11,13 @@ from fastapi import FastAPI, Query, Request, Response
 from service.api.deadlines import within
 from service.api.maps import map_images
 from service.engine.engine import Engine
-from service.http.backend import backend_of, limit_of
 from service.http.cache_headers import (
     ASK_ALWAYS_PRIVATE,
     FOR_EVER_PRIVATE,
     is_current,
     not_modified,
 )
+from service.http.envelope import backend_of, limit_of
 from service.http.openapi.app import problems
 from visloc.archive import MapOutline, SetOutline
 from visloc.archive.checks import is_set

@@ -2,25 +2,35 @@
 
 from __future__ import annotations
 
+import pickle
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from service.values import ONLY_SENSOR, ImageJob, Localization, Rig, RigJob
-from service.workers.photos import DecodedQuery
+from service.values import ONLY_SENSOR, ImageJob, Localization, PackedQuery, Query, Rig, RigJob
 from visloc.archive import Map
 from visloc.archive.places import anchor_rms
 from visloc.errors import InvalidInput, refuse
+from visloc.features import LocalFeatureExtractor
 from visloc.geometry import Pose
 from visloc.localization.localizer import Localizer
 from visloc.localization.map_view.constraints import Constraints
 from visloc.localization.query.camera import MapCamera, resolve_camera
+from visloc.localization.query.feature_cache import FeatureCache
 from visloc.localization.solving import Look, SeenImage
 from visloc.options import LocalizeOptions
-from visloc.photos.reading import Photo
+from visloc.photos.reading import ImageLimits, Photo, read_photo, with_mask
 from visloc.priors import Priors
-from visloc.runtime.timing import summed
-from visloc.types import Evidence, InstantAnswer, QueryFeatures, Reason, Refusal, RigSensor
+from visloc.runtime.threads import summed, timed
+from visloc.types import (
+    Evidence,
+    InstantAnswer,
+    MaskedImage,
+    QueryFeatures,
+    Reason,
+    Refusal,
+    RigSensor,
+)
 
 _MAX_LISTED = 500  # characters of names from outside
 # Errors of the request, not of one image, have codes that begin so.
@@ -191,3 +201,53 @@ def _nothing_here(look: Look) -> Look:
             "retrieval", Reason.NO_PHOTO_NEAR, "the priors name other tiles, which do not show this"
         ),
     )
+
+
+# Returns the extractor of local features with this name.
+ExtractorOf = Callable[[str], LocalFeatureExtractor]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DecodedQuery:
+    """A decoded photo, or the features that were sent instead of it.
+
+    Attributes:
+        found: features found in the photo so far.
+        seconds: wall time by stage so far.
+    """
+
+    query: Photo | QueryFeatures
+    found: FeatureCache
+    seconds: dict[str, float]
+
+
+def decode(query: Query, limits: ImageLimits, extractor_of: ExtractorOf) -> DecodedQuery:
+    """Decode an encoded photo, or unpack what ``pack`` returned in this service.
+
+    Raises:
+        InvalidInput: ``image.*`` or ``mask.size``.
+        TooLarge: ``image.too_large``.
+    """
+    if isinstance(query, PackedQuery):
+        photo, found, seconds = pickle.loads(query.data)
+        found = {(extractor_of(name), *how): features for (name, *how), features in found.items()}
+        return DecodedQuery(photo, found, seconds)
+    if isinstance(query, QueryFeatures):
+        return DecodedQuery(query, {}, {})
+    spent: dict[str, float] = {}
+    with timed(spent, "decode"):
+        if isinstance(query, MaskedImage):
+            photo = with_mask(read_photo(query.image, limits), query.mask, limits)
+        else:
+            photo = read_photo(query, limits)
+    return DecodedQuery(photo, {}, spent)
+
+
+def pack(decoded: DecodedQuery) -> PackedQuery:
+    """Pickle a query for another process. Extractors, which each process has, go by name."""
+    found = {
+        (extractor.fingerprint.name, *how): features
+        for (extractor, *how), features in decoded.found.items()
+    }
+    parts = decoded.query, found, decoded.seconds
+    return PackedQuery(pickle.dumps(parts, pickle.HIGHEST_PROTOCOL))

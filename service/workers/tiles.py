@@ -9,7 +9,7 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
-from service.workers.photos import DecodedQuery, ExtractorOf
+from service.workers.instants import DecodedQuery, ExtractorOf
 from visloc.archive import MapSet, open_map
 from visloc.errors import InvalidInput, MapCorrupt
 from visloc.features import LocalFeatureExtractor
@@ -27,7 +27,7 @@ from visloc.localization.query.fingerprints import check_fingerprint
 from visloc.localization.turning import QUARTERS
 from visloc.options import LocalizeOptions
 from visloc.photos.reading import Photo
-from visloc.runtime.timing import timed
+from visloc.runtime.threads import timed
 from visloc.sets.choosing import TileScore
 from visloc.sets.coarse import rank_tiles
 from visloc.types import LocalFeatures

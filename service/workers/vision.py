@@ -34,16 +34,18 @@ from service.values import (
     WorkerSettings,
 )
 from service.workers.instants import (
+    DecodedQuery,
     Target,
     check_images,
     check_options,
     check_priors,
+    decode,
+    pack,
     refused_before,
     rig_in_map,
 )
 from service.workers.judging import gated, judged
 from service.workers.open_maps import OpenMaps
-from service.workers.photos import DecodedQuery, decode, pack
 from service.workers.sequences import SequenceRun
 from visloc.drawing.matches_picture import draw_overlay
 from visloc.errors import InvalidInput, VislocError
@@ -55,8 +57,7 @@ from visloc.localization.turning import is_worth_turning
 from visloc.options import LocalizeOptions
 from visloc.photos.reading import ImageLimits, Photo
 from visloc.priors import Priors
-from visloc.runtime.threads import use_threads
-from visloc.runtime.timing import summed
+from visloc.runtime.threads import summed, use_threads
 from visloc.types import InstantAnswer, Refusal
 
 logger = logging.getLogger(__name__)

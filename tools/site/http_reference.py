@@ -8,7 +8,7 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 from service.http.app import create_app
-from service.http.backend import Backend
+from service.http.envelope import Backend
 from service.settings import read_settings
 
 Schema = dict[str, Any]

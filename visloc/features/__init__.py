@@ -50,7 +50,7 @@ GLOBAL_FEATURES: Mapping[str, tuple[str, str]] = {
     "convvlad": ("visloc.features.descriptors.convvlad", "load_convvlad"),
     "densevlad": ("visloc.features.descriptors.densevlad", "load_densevlad"),
     "gem": ("visloc.features.descriptors.gem", "load_gem"),
-    "localvlad": ("visloc.features.descriptors.localvlad", "load_localvlad"),
+    "localvlad": ("visloc.features.descriptors.vlad", "load_localvlad"),
 }
 # XFeat is free for any use and fast; R2D2's published weights are for research only.
 DEFAULT_LOCAL_FEATURES = "xfeat"

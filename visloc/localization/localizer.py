@@ -58,7 +58,7 @@ from visloc.photos.reading import Photo
 from visloc.priors import NO_PRIORS, Priors
 from visloc.retrieval.fusion import LateFusion, chosen_fusion
 from visloc.retrieval.index import Retrieved, compare, excluded_photos, retrieve
-from visloc.runtime.timing import timed
+from visloc.runtime.threads import timed
 from visloc.types import (
     Answer,
     CameraSource,

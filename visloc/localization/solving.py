@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 from visloc.errors import VislocError, refuse
 from visloc.geometry import Camera, Pose
 from visloc.localization.acceptance.camera_check import only_focal_length_contradicts
-from visloc.localization.acceptance.corrected_cameras import (
+from visloc.localization.acceptance.corrections import (
     NO_CAMERAS,
     CamerasSoFar,
     with_corrected_cameras,
+    with_redraws,
 )
 from visloc.localization.acceptance.evidence import Shown
 from visloc.localization.acceptance.gates import Problem, accepted, not_better_elsewhere
 from visloc.localization.acceptance.judge import not_probable_enough
-from visloc.localization.acceptance.redraws import with_redraws
 from visloc.localization.acceptance.rivals import Proposed, stronger_place
 from visloc.localization.map_view.constraints import Constraints, MapGeometry
 from visloc.localization.query.camera import guessed_camera
@@ -29,7 +29,7 @@ from visloc.pose.covariance import position_covariance, with_origin
 from visloc.pose.generalized import GeneralizedPose
 from visloc.pose.reprojection import MatchedView
 from visloc.priors import Priors
-from visloc.runtime.timing import summed, timed
+from visloc.runtime.threads import summed, timed
 from visloc.types import (
     CameraSource,
     CoarsePose,

@@ -1,12 +1,13 @@
-"""How many threads this process computes with."""
+"""How many threads this process computes with, and how long its steps take."""
 
 from __future__ import annotations
 
 import importlib
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from time import perf_counter
 from types import ModuleType
 
 import cv2
@@ -60,3 +61,20 @@ def threads(count: int) -> Iterator[None]:
             os.environ.pop(_VARIABLE, None)
         else:
             os.environ[_VARIABLE] = variable
+
+
+@contextmanager
+def timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
+    """Note how long the block took."""
+    start = perf_counter()
+    yield
+    seconds[stage] = perf_counter() - start
+
+
+def summed(*parts: Mapping[str, float]) -> dict[str, float]:
+    """Add up wall times by stage, in the order in which stages are named first."""
+    total: dict[str, float] = {}
+    for part in parts:
+        for stage, seconds in part.items():
+            total[stage] = total.get(stage, 0.0) + seconds
+    return total

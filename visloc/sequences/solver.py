@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from visloc.errors import refuse
 from visloc.geometry import center_covariance, covariance_from_center, rotation_angle
-from visloc.localization.acceptance.corrected_cameras import NO_CAMERAS
+from visloc.localization.acceptance.corrections import NO_CAMERAS
 from visloc.localization.acceptance.gates import contradicts_priors, registration_for
 from visloc.localization.acceptance.judge import not_probable_enough
 from visloc.localization.map_view.constraints import Constraints, MapGeometry
@@ -33,7 +33,7 @@ from visloc.options import LEAST_PROBABILITY, LocalizeOptions
 from visloc.pose.covariance import with_origin
 from visloc.pose.motion import RelativeMotion, UncertainPose, link_from_motion
 from visloc.priors import Priors
-from visloc.runtime.timing import timed
+from visloc.runtime.threads import timed
 from visloc.sequences.filling import MAX_GAP_S, Odometry, TimeUnit, TracedPose, fill_sequence
 from visloc.sequences.odometry_readings import (
     ALL_READINGS,

@@ -13,8 +13,8 @@ from starlette.responses import Response
 
 from service.api.answers import geoposes_to_words
 from service.api.deadlines import within
-from service.http.backend import Backend, backend_of, limit_of
 from service.http.bodies import checked_media_type, parsed
+from service.http.envelope import Backend, backend_of, limit_of
 from service.http.openapi.app import problems
 from service.http.responses import json_response, problem_response, while_connected
 from service.security.access import LOCALIZING

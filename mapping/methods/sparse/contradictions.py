@@ -27,7 +27,7 @@ from scipy.spatial import KDTree
 
 from mapping.progress import ItemProgress, not_told
 from mapping.stages.landmarks import View
-from visloc.pose.distance import viewpoints_apart
+from visloc.pose.covariance import viewpoints_apart
 from visloc.pose.reprojection import project
 
 # Photos near one, by ``viewpoints_apart`` (radians). What they observe it should show, and it is

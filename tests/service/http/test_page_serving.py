@@ -18,8 +18,8 @@ from starlette.datastructures import Headers
 import service.http.static_page
 from service.http.acceptor import OpenConnections
 from service.http.app import create_app
-from service.http.backend import Backend
 from service.http.cache_headers import is_current, takes_gzip
+from service.http.envelope import Backend
 from service.http.slow_clients import Arrivals
 from service.security.access import needed_over_http, open_access
 from service.security.key_file import Scope, edited_keys, new_key

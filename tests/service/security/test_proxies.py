@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from service.security.proxies import address_of_grpc, caller_of, networks_of
+from service.security.access import address_of_grpc, caller_of, networks_of
 from service.settings import SettingsError
 
 PROXY, CALLER, FORGED = "10.0.0.7", "203.0.113.9", "198.51.100.1"

@@ -24,8 +24,8 @@ from service.values import (
 )
 from service.workers import open_maps as opening
 from service.workers import vision
+from service.workers.instants import DecodedQuery
 from service.workers.open_maps import OpenMaps
-from service.workers.photos import DecodedQuery
 from service.workers.process import _reply_to
 from service.workers.vision import Vision
 from visloc.archive import MapStore

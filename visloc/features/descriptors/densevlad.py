@@ -17,14 +17,16 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from visloc.features.base import Fingerprint, GlobalDescriptor
-from visloc.features.descriptors.dense_grid import (
+from visloc.features.descriptors.vlad import (
     CELL_PX,
     CELLS_PER_SIDE,
     MIN_CONTRAST,
     ORIENTATIONS,
+    VLAD_PARAMETERS,
+    VladDescriptor,
     tent,
+    vlad_of_sums,
 )
-from visloc.features.descriptors.vlad import VLAD_PARAMETERS, VladDescriptor, vlad_of_sums
 from visloc.options import Inference
 from visloc.runtime.device import has_cuda, torch_device
 from visloc.types import LocalFeatures

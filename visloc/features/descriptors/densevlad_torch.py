@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from visloc.features.descriptors.dense_grid import (
+from visloc.features.descriptors.vlad import (
     CELL_PX,
     CELLS_PER_SIDE,
     MIN_CONTRAST,

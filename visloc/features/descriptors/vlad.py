@@ -9,17 +9,19 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from visloc.features.base import Fingerprint
+from visloc.features.base import Fingerprint, GlobalDescriptor
 from visloc.features.descriptors.whitening import (
     WHITENING_PARAMETERS,
     WhitenedDescriptor,
     unit_rows,
 )
+from visloc.options import Inference
 from visloc.types import LocalFeatures
 
 VOCABULARY_SIZE = 128
@@ -140,3 +142,43 @@ def _sum_by_nearest(
     membership = sparse.csr_array((np.ones(n, np.float32), nearest, np.arange(n + 1)), shape=(n, k))
     counts = np.bincount(nearest, minlength=k).astype(np.float32)
     return np.asarray(membership.T @ words, dtype=np.float32), counts
+
+
+def load_localvlad(
+    _weights_dir: Path | None = None,
+    _inference: Inference = Inference.AUTO,
+    _threads: int | None = None,
+) -> GlobalDescriptor:
+    """Make the descriptor, which needs no weights."""
+    return LocalVlad()
+
+
+class LocalVlad(VladDescriptor):
+    """A photo's words are the descriptors of its local features, whatever their length."""
+
+    # The local features have a fingerprint of their own.
+    fingerprint = Fingerprint("localvlad", revision=1, parameters=dict(VLAD_PARAMETERS))
+    needs_image = False
+    needs_local_features = True
+
+    def words(
+        self,
+        rgb: NDArray[np.uint8],  # noqa: ARG002 - not needed
+        local: LocalFeatures,
+    ) -> NDArray[np.float32]:
+        """Return the local features' descriptors (N, D)."""
+        return local.descriptors
+
+
+ORIENTATIONS = 8  # a power of two
+CELLS_PER_SIDE = 4
+# A cell is this wide in the photo shrunk for its scale; patches overlap by all but one cell.
+CELL_PX = 4
+# Grey levels between the neighbours of a pixel, averaged over a patch: below, it is mere noise.
+MIN_CONTRAST = 1.0
+
+
+def tent() -> NDArray[np.float32]:
+    """Return the weights of a cell's pixels along one axis: twice as wide as the cell."""
+    weights = np.convolve(np.ones(CELL_PX), np.ones(CELL_PX)) / CELL_PX**2
+    return weights.astype(np.float32)

@@ -26,7 +26,7 @@ from visloc.options import (
     LocalizeOptions,
     RegistrationPreset,
 )
-from visloc.pose.distance import mahalanobis2
+from visloc.pose.covariance import mahalanobis2
 from visloc.pose.generalized import (
     GeneralizedPose,
     estimate_generalized_pose,

@@ -21,8 +21,14 @@ from visloc.features.resolution import Resolution, WorkingResolution
 from visloc.geometry import Pose
 from visloc.localization.map_view.local_model import LocalModel
 from visloc.matching.products import EightBitRows
-from visloc.pose.covariance import PHOTO_ONLY, MapErrors, largest_std, with_origin
-from visloc.pose.distance import mahalanobis2, viewpoints_apart
+from visloc.pose.covariance import (
+    PHOTO_ONLY,
+    MapErrors,
+    largest_std,
+    mahalanobis2,
+    viewpoints_apart,
+    with_origin,
+)
 from visloc.pose.generalized import MAX_FOCAL, MIN_FOCAL
 from visloc.pose.gravity import KnownGravity, gravity_deviation
 from visloc.pose.reprojection import MatchedView, normalized_rays

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from visloc.features.base import GlobalDescriptor
-from visloc.features.descriptors.localvlad import LocalVlad
+from visloc.features.descriptors.vlad import LocalVlad
 from visloc.types import LocalFeatures
 
 NO_PIXELS = np.zeros((1, 1, 3), np.uint8)

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from visloc.geometry import Pose, center_covariance
-from visloc.localization.acceptance import redraws
+from visloc.localization.acceptance import corrections
 from visloc.localization.acceptance.gates import Problem
 from visloc.localization.map_view.constraints import Constraints
 from visloc.localization.solving import Matches, SeenImage, Solved, solve_instant
@@ -82,7 +82,7 @@ def test_of_smeared_photos_the_stated_covariance_grows_to_what_is_true(
 ) -> None:
     images = [make(place, 40.0, seed) for seed in range(TRIALS)]
     answered = [solved for each in images if (solved := solve(each, place)).answer.pose]
-    monkeypatch.setattr(redraws, "_is_asked", lambda *_: False)
+    monkeypatch.setattr(corrections, "_is_asked", lambda *_: False)
     of_one_minimum = [solved for each in images if (solved := solve(each, place)).answer.pose]
     assert len(answered) == len(of_one_minimum) >= TRIALS // 2
     before, after = distances2(of_one_minimum, place), distances2(answered, place)
@@ -97,7 +97,7 @@ def test_of_a_facade_the_wrong_one_of_two_poses_is_refused_or_stated_as_uncertai
 ) -> None:
     images = [[place.image(facade(place, seed))] for seed in range(TRIALS)]
     answered = [solved for each in images if (solved := solve(each, place)).answer.pose]
-    monkeypatch.setattr(redraws, "_is_asked", lambda *_: False)
+    monkeypatch.setattr(corrections, "_is_asked", lambda *_: False)
     of_one_minimum = [solved for each in images if (solved := solve(each, place)).answer.pose]
     limit = chi2.ppf(0.999, 6)
     assert np.sum(distances2(of_one_minimum, place) > 10 * limit) >= 2
@@ -107,7 +107,7 @@ def test_of_a_facade_the_wrong_one_of_two_poses_is_refused_or_stated_as_uncertai
 
 def test_a_sharp_photo_is_not_searched_again(place: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     image = place.image(place.matches(TRUTH, 400, 100, seed=1, noise=2.0))
-    monkeypatch.setattr(redraws, "widening", None)
+    monkeypatch.setattr(corrections, "widening", None)
     assert solve([image], place).answer.pose is not None
 
 
@@ -118,7 +118,7 @@ def test_the_covariance_of_a_pose_that_holds_stays_as_it_is(place: Any) -> None:
         assert solved.pose is not None
         constraints = Constraints(place.geometry, NO_PRIORS)
         problem = Problem(solved.views, (CameraSource.GIVEN,), LocalizeOptions(), constraints)
-        assert 1.0 <= redraws.widening(problem, solved.pose) <= 2.0
+        assert 1.0 <= corrections.widening(problem, solved.pose) <= 2.0
 
 
 def test_a_pose_that_other_draws_do_not_find_at_all_is_refused(
@@ -126,7 +126,7 @@ def test_a_pose_that_other_draws_do_not_find_at_all_is_refused(
 ) -> None:
     images = photo(place, 40.0, 0)
     assert solve(images, place).answer.pose is not None
-    monkeypatch.setattr(redraws, "widening", lambda *_: np.inf)
+    monkeypatch.setattr(corrections, "widening", lambda *_: np.inf)
     refusal = solve(images, place).answer.refusal
     assert refusal is not None
     assert refusal.reason is Reason.UNCERTAIN_POSE
