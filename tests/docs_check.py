@@ -13,6 +13,7 @@ name their language (```text).
 from __future__ import annotations
 
 import argparse
+import functools
 import importlib
 import json
 import os
@@ -28,6 +29,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import typer
@@ -155,6 +157,7 @@ RULES = (
     Rule(Tier.ELSEWHERE, r"", r"curl .*//maps\.example\.org", "a host of that name"),
     Rule(Tier.PARSED, r"", r"([A-Z]+=\S+ |[A-Z]+=\".*\" )?make ", "a target of its own"),
     Rule(Tier.PARSED, r"examples/plugin", r"", "needs it installed; tests/examples/test_plugin.py"),
+    Rule(Tier.PARSED, r"visloc_extensions/scans", r"", "needs a scan of a phone; its tests"),
     Rule(Tier.PARSED, r"map-sets", r"mapping (set|split)", _PLACES),
     Rule(Tier.PARSED, r"mapping\.md", r"mapping capture", "the tutorial runs it"),
     Rule(Tier.PARSED, r"your-app", r"visloc-service .*cors", "test_web_overlay.py"),
@@ -244,7 +247,7 @@ def parse(command: Command) -> None:
     if program == "make":
         _parse_make(command)
     parser = _PARSERS.get(program)
-    if parser is None:
+    if parser is None or (program, arguments[0]) in of_absent_extensions():
         return
     if command.is_inline and arguments[0] == "-m" and len(arguments) == 2:
         importlib.import_module(arguments[1])  # only named
@@ -256,6 +259,19 @@ def parse(command: Command) -> None:
     except SystemExit as error:
         if error.code:
             raise ValueError(f"{command.text}: not what it takes") from error
+
+
+@functools.cache
+def of_absent_extensions() -> set[tuple[str, str]]:
+    """Return the commands that docs/extensions.md names and that are not here."""
+    from clients.cli.main import app as localize
+    from mapping.cli.main import app as mapping
+
+    text = (ROOT / "docs" / "extensions.md").read_text(encoding="utf-8")
+    apps = {"mapping": mapping, "localize": localize}
+    here: dict[str, Any] = {name: typer.main.get_command(app) for name, app in apps.items()}
+    named = re.findall(r"`(mapping|localize) ([a-z-]+)", text)
+    return {(program, name) for program, name in named if name not in here[program].commands}
 
 
 def _parse_typer(app: typer.Typer, arguments: Sequence[str]) -> None:

@@ -47,7 +47,6 @@ from visloc_api.words.status import Problem
 
 ROOT = Path(__file__).resolve().parents[1]
 FIRST_STEPS, API = ROOT / "docs" / "first-steps.md", ROOT / "docs" / "api.md"
-EXTENSIONS = ROOT / "docs" / "extensions.md"
 PAGES = [
     page
     for pattern in ("*.md", "docs/**/*.md", "visloc_extensions/*/README.md")
@@ -230,7 +229,7 @@ def test_the_example_that_reads_points_sees_the_map(built_maps: Path, desk: Desk
             r"make|\.venv/bin/(visloc-service|pip |"
             r"mapping (build|capture|anchor|edit|set|split|prune|merge|update|upgrade|pack))"
             r"|.*/mapping import .* --map|.* --features-dir|.*/localize maps push"
-            r"|.*/localize bag |.*/mapping import rosbag"
+            r"|.*/localize bag |.*/mapping import rosbag|.* --map with-sift"
             r"|.* https://maps\.example\.org",
             line,
         )
@@ -363,9 +362,9 @@ def test_every_command_and_flag_exists(capsys: pytest.CaptureFixture[str]) -> No
         "localize": options_of(clients.cli.main.app),
         "visloc-service": {"": of_service},
     }
-    of_extensions = re.findall(r"`(mapping|localize) ([a-z-]+)`", EXTENSIONS.read_text())
+    absent = docs_check.of_absent_extensions()
     for name, command in in_pages(r"`(mapping|localize) ([a-z][a-z-]*)"):
-        assert command in programs[name] or (name, command) in of_extensions, f"{name} {command}"
+        assert command in programs[name] or (name, command) in absent, f"{name} {command}"
     known = {
         flag for commands in programs.values() for flags in commands.values() for flag in flags
     }
