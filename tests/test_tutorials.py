@@ -21,7 +21,6 @@ from tests import docs_check
 TUTORIALS = {
     "beach": 5,
     "building": 8,
-    "compare-features": 8,
     "for-others": 12,
     "from-hloc": 5,
     "robot": 4,
@@ -29,7 +28,7 @@ TUTORIALS = {
 }
 WITHOUT_COMMANDS = "from-hosted"
 # They make maps, or start several services.
-SLOW = ("for-others", "beach", "building", "compare-features", "from-hloc", "robot")
+SLOW = ("for-others", "beach", "building", "from-hloc", "robot")
 
 
 @pytest.fixture(scope="module")

@@ -152,7 +152,6 @@ def test_verify_tells_that_the_features_of_a_map_are_others(
             ("build", "nowhere", "--map", "new", "--local-features", "surf"),
             "[features.unknown] local_features: the features are unknown; if a package provides",
         ),
-        (("export-features", "nowhere", "--output", "out"), "[kapture.no_dataset]"),
         (("build", "x", "--map", "new", "--method", "nerf"), "[build.method] --method"),
         (("build", "x", "--map", "new", "--pairs", "near"), "[build.pairs] --pairs"),
         (("build", "x", "--map", "new", "--poses", "guess"), "[build.poses] --poses"),
@@ -241,8 +240,7 @@ def test_what_the_system_refuses_is_one_line_too(run: Run, tmp_path: Path) -> No
 @pytest.mark.parametrize(
     "command",
     [
-        *("", "build", "pairs", "import", "export", "inspect", "verify"),
-        *("export-features", "sample"),
+        *("", "build", "pairs", "import", "export", "inspect", "verify", "sample"),
     ],
 )
 def test_every_command_has_help(run: Run, command: str) -> None:

@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from typer.testing import CliRunner
 
+from mapping.cli.main import app
 from tests.turning import store_photo_turned, turned_points
 from visloc.archive import MapStore
-from visloc.errors import Conflict
+from visloc.errors import Conflict, DatasetError
 from visloc.features import make_global_descriptor, make_local_features
 from visloc.geometry import PixelOrigin
 from visloc.kapture import open_local_features, read_dataset, read_local
@@ -206,3 +208,9 @@ def test_features_of_turned_photos_are_in_stored_pixels(sample: Path, tmp_path: 
         rows = read_local(*sets, "mapping/left/0001.jpg", size, PixelOrigin.CORNER)
         keypoints.append(rows[0])
     np.testing.assert_allclose(keypoints[0], turned_points(keypoints[1], size, 3), atol=1e-3)
+
+
+def test_the_command_refuses_what_is_no_dataset() -> None:
+    done = CliRunner().invoke(app, ["export-features", "nowhere", "--output", "out"])
+    assert isinstance(done.exception, DatasetError)
+    assert done.exception.code == "kapture.no_dataset"
