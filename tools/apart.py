@@ -85,8 +85,7 @@ def check(only: str | None) -> bool:
     # The entry points of the copy: its metadata lies before those of the installed project.
     metadata = APART / "metadata"
     install = ("-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation")
-    where = ("--target", str(metadata), "--editable", str(TREE))
-    subprocess.run((sys.executable, *install, *where), check=True)
+    subprocess.run((sys.executable, *install, "--target", metadata, TREE), check=True)
     environment = {**os.environ, "PYTHONPATH": f"{TREE}{os.pathsep}{metadata}"}
     commands: list[Sequence[str]] = []
     if only != "tests":
