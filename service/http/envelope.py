@@ -1,4 +1,4 @@
-"""The outermost layer of the HTTP API: ids, the log, an answer to every request; what routes use."""
+"""The outermost layer of the HTTP API: ids, the log, answers to all requests; what routes use."""
 
 from __future__ import annotations
 
