@@ -47,7 +47,7 @@ from visloc.localization.localizer import Localizer
 from visloc.localization.solving import SeenImage
 from visloc.options import LocalizeOptions
 from visloc.photos.reading import read_photo_file
-from visloc.pose.covariance import position_covariance
+from visloc.pose.motion import position_covariance
 from visloc.priors import NO_PRIORS
 from visloc.sequences.filling import TimeUnit
 from visloc.sequences.solver import SeenInstant, SequenceSolver

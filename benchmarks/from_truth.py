@@ -23,8 +23,8 @@ from visloc.localization.acceptance.gates import registration_for
 from visloc.localization.localizer import Localizer
 from visloc.options import LocalizeOptions
 from visloc.photos.reading import read_photo_file
-from visloc.pose.covariance import moved_origin
 from visloc.pose.generalized import refine_generalized_pose
+from visloc.pose.motion import moved_origin
 from visloc.pose.reprojection import MatchedView
 
 OPTIONS = LocalizeOptions()

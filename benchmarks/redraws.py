@@ -35,7 +35,7 @@ from visloc.localization.acceptance.judge import TIE_ANGLE, TIE_REACH_SHARE
 from visloc.localization.localizer import Localizer
 from visloc.localization.map_view.constraints import Constraints
 from visloc.options import LocalizeOptions
-from visloc.pose.covariance import moved_origin, position_covariance
+from visloc.pose.motion import moved_origin, position_covariance
 from visloc.pose.reprojection import MatchedView
 from visloc.priors import NO_PRIORS
 

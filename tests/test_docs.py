@@ -34,7 +34,7 @@ from visloc.archive import MapStore
 from visloc.errors import InvalidInput, catalogue
 from visloc.geometry import Camera, Pose
 from visloc.options import PRESETS, LocalizeOptions
-from visloc.pose.covariance import position_covariance
+from visloc.pose.motion import position_covariance
 from visloc.types import Reason
 from visloc_api.words.answers import InstantAnswer, LocalizeResponse
 from visloc_api.words.maps import MapInfo

@@ -17,7 +17,7 @@ from visloc.archive import Anchor, Geodetic
 from visloc.archive.places import enu_of, origin_of
 from visloc.geodesy import enu_from_ecef, geodetic_from_enu
 from visloc.geometry import Pose
-from visloc.pose.covariance import position_covariance
+from visloc.pose.motion import position_covariance
 
 # forward = z of the camera, left = -x, up = -y
 _BODY_FROM_DEVICE = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])

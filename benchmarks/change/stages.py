@@ -20,8 +20,8 @@ from visloc.localization.map_view.constraints import Constraints
 from visloc.localization.query.feature_cache import FeatureCache
 from visloc.localization.solving import Look
 from visloc.options import LocalizeOptions
-from visloc.pose.covariance import moved_origin, position_covariance
 from visloc.pose.generalized import GeneralizedPose, refine_generalized_pose
+from visloc.pose.motion import moved_origin, position_covariance
 from visloc.pose.reprojection import MatchedView, project
 from visloc.priors import NO_PRIORS
 from visloc.retrieval.index import retrieve

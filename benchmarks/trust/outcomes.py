@@ -12,7 +12,7 @@ from visloc.errors import VislocError
 from visloc.evaluation import Threshold, pose_error
 from visloc.geometry import Camera, Pose
 from visloc.photos.reading import Photo
-from visloc.pose.covariance import position_covariance
+from visloc.pose.motion import position_covariance
 from visloc.types import Answer, Evidence, InstantAnswer, Localized, RigPose
 
 

@@ -26,7 +26,7 @@ from visloc.geometry import Pose, center_covariance
 from visloc.localization.acceptance.judge import TIE_ANGLE, TIE_REACH_SHARE
 from visloc.localization.map_view.constraints import MapGeometry, Viewpoints
 from visloc.options import LocalizeOptions
-from visloc.pose.covariance import PHOTO_ONLY
+from visloc.pose.motion import PHOTO_ONLY
 
 # How many photos are tried: a fifth of the map, within these limits. The test then takes a tenth of
 # the time of a build (docs/decisions/0028-the-maps-own-test.md).

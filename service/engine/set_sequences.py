@@ -44,7 +44,7 @@ from service.workers.pool import Workers
 from service.workers.tasks import Vision
 from visloc.archive import SetOutline
 from visloc.errors import InvalidInput, NotFound, Unavailable, VislocError, inside, refuse
-from visloc.pose.covariance import moved_pose
+from visloc.pose.motion import moved_pose
 from visloc.priors import Priors
 from visloc.sequences.filling import guess_time_unit
 from visloc.sets.choosing import allowed_tiles, is_clear, nearest_tile

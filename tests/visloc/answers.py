@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from visloc.geometry import Camera, Pose
 from visloc.options import ReadAs
-from visloc.pose.covariance import position_covariance
+from visloc.pose.motion import position_covariance
 from visloc.types import (
     CameraSource,
     Evidence,

@@ -22,7 +22,7 @@ from visloc.localization.map_view.constraints import Constraints, MapGeometry
 from visloc.options import ReadAs
 from visloc.photos.reading import turn_of, upright_from_stored
 from visloc.pose.average import average_pose, deviations
-from visloc.pose.covariance import with_origin
+from visloc.pose.motion import with_origin
 from visloc.retrieval.fusion import LateFusion
 from visloc.retrieval.index import retrieve
 from visloc.retrieval.interpolation import WEIGHTINGS, cosine_similarity, joined

@@ -25,8 +25,8 @@ from visloc.localization.map_view.constraints import Constraints, MapGeometry
 from visloc.localization.query.camera import guessed_camera
 from visloc.localization.turning import REASONS_OF_TURNED_PHOTOS
 from visloc.options import LocalizeOptions, ReadAs, Solver
-from visloc.pose.covariance import position_covariance, with_origin
 from visloc.pose.generalized import GeneralizedPose
+from visloc.pose.motion import position_covariance, with_origin
 from visloc.pose.reprojection import MatchedView
 from visloc.priors import Priors
 from visloc.runtime.threads import summed, timed

@@ -1,4 +1,4 @@
-"""Relative motion between instants: how it is chained, and whether two poses agree with it.
+"""Uncertain poses at another centre or in a map with errors, and motion between instants.
 
 Inside the window of a sequence, an uncertain pose is perturbed from the left as a whole,
 pose <- (Exp(w), dt) @ pose, w (rad) before dt: both are then read in the rig's own frame, and no
@@ -16,7 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.geometry import Pose, cross_matrix, rotation_angle
+from visloc.geometry import Pose, Similarity, cross_matrix, rotation_angle
+from visloc.types import Uncertainty
 
 # What is assumed of a motion that came without a covariance: a wheel's or a phone's odometry.
 DEFAULT_ROTATION_STD = math.radians(0.2)
@@ -139,3 +140,135 @@ def adjoint(pose: Pose) -> NDArray[np.float64]:
     matrix[:3, :3] = matrix[3:, 3:] = pose.rotation
     matrix[3:, :3] = cross_matrix(pose.translation) @ pose.rotation
     return matrix
+
+
+def position_covariance(
+    cam_from_world: Pose, covariance: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the covariance (3, 3) of the camera centre in the world, from that of the pose (6, 6).
+
+    The centre is -R^T t. If R moves by Exp(w) and t by dt, it moves by -R^T (dt + [t] w), where [t]
+    is the matrix of the cross product.
+    """
+    jacobian = -cam_from_world.rotation.T @ np.hstack(
+        [cross_matrix(cam_from_world.translation), np.eye(3)]
+    )
+    return np.asarray(jacobian @ covariance @ jacobian.T)
+
+
+def with_origin(
+    cam_from_local: Pose, covariance: NDArray[np.float64], origin: NDArray[np.float64]
+) -> tuple[Pose, NDArray[np.float64]]:
+    """Move a pose found in coordinates relative to ``origin`` (3,) to the world.
+
+    x_local = x_world - origin, so t_world = t_local - R origin. The covariance of t_world grows by
+    the rotation's error times the distance of the origin.
+    """
+    jacobian = np.eye(6)
+    jacobian[3:, :3] = cross_matrix(cam_from_local.rotation @ origin)
+    return moved_origin(cam_from_local, origin), jacobian @ covariance @ jacobian.T
+
+
+def moved_origin(cam_from_local: Pose, origin: NDArray[np.float64]) -> Pose:
+    """Move a pose found in coordinates relative to ``origin`` (3,) to the world."""
+    rotation = cam_from_local.rotation
+    return Pose(rotation, cam_from_local.translation - rotation @ origin)
+
+
+def moved_pose(
+    device_from_b: Pose, covariance: NDArray[np.float64], a_from_b: Similarity
+) -> tuple[Pose, NDArray[np.float64]]:
+    """Move a pose and its covariance (6, 6) to another frame and unit.
+
+    The translation is t_a = scale t_b - R_a t, with R_a and t_a of the result and t of
+    ``a_from_b``. So its error has two parts: that of t_b, and the rotation's times the distance
+    between the origins.
+    """
+    pose = a_from_b.move(device_from_b)
+    jacobian = np.eye(6)
+    jacobian[3:, 3:] *= a_from_b.scale
+    jacobian[3:, :3] = cross_matrix(pose.rotation @ a_from_b.translation)
+    moved = jacobian @ covariance @ jacobian.T
+    return pose, (moved + moved.T) / 2
+
+
+def largest_std(pose: Pose, covariance: NDArray[np.float64]) -> float:
+    """Return the standard deviation of a device's position along its worst axis."""
+    return math.sqrt(max(float(np.linalg.eigvalsh(position_covariance(pose, covariance))[-1]), 0.0))
+
+
+@dataclass(frozen=True, slots=True)
+class MapErrors:
+    """How much further poses in a map are off than the scatter of their photos tells.
+
+    Attributes:
+        position_factor: of the standard deviations of the camera's centre; at least 1.
+        orientation_factor: of the standard deviations of the rotation about that centre.
+        uncertainty: whether the factors were measured.
+        position_std: by how much the map as a whole is bent, along each axis of the world: standard
+            deviation, in its unit.
+    """
+
+    position_factor: float
+    orientation_factor: float
+    uncertainty: Uncertainty = Uncertainty.WHOLE
+    position_std: float = 0.0
+
+    def whole(
+        self,
+        rig_from_world: Pose,
+        covariance: NDArray[np.float64],
+        of_camera: NDArray[np.float64] | None = None,
+    ) -> NDArray[np.float64]:
+        """Widen the covariance (6, 6) of a pose by the errors of the map.
+
+        The part of it that comes from the doubt in the camera, ``of_camera``, stays: no landmark
+        has a say in it. Rotation w and centre e, both in the rig's axes, are scaled apart, which
+        keeps how they hang together: e = -(dt + [t] w), with [t] the matrix of the cross product.
+        That matrix is its own inverse.
+        """
+        if self.uncertainty is Uncertainty.PHOTO_ONLY:
+            return covariance  # to the last bit
+        factors = self.orientation_factor, self.position_factor
+        if of_camera is None:
+            return self._bent(_widened(rig_from_world, covariance, *factors))
+        widened = _widened(rig_from_world, covariance - of_camera, *factors)
+        return self._bent(widened + of_camera)
+
+    def part(self, rig_from_world: Pose, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the part (6, 6) of the whole covariance that is the map's own.
+
+        Poses next to each other share these errors, which no number of photos averages out. Added
+        to the photo's ``covariance``, it gives the variances that ``whole`` has, of the rotation
+        and of the camera's centre. It is a covariance itself, as their difference not always is.
+        """
+        factors = self.orientation_factor, self.position_factor
+        beyond = (math.sqrt(f**2 - 1.0) for f in factors)
+        return self._bent(_widened(rig_from_world, covariance, *beyond))
+
+    def _bent(self, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Add what the whole map is off by, the same in all directions."""
+        if self.position_std == 0.0:
+            return covariance  # to the last bit
+        # dt = -R e, and R takes nothing away from what is the same in all directions.
+        moved = np.repeat([0.0, self.position_std**2], 3)
+        return np.asarray(covariance + np.diag(moved))
+
+
+def _widened(
+    rig_from_world: Pose,
+    covariance: NDArray[np.float64],
+    orientation_factor: float,
+    position_factor: float,
+) -> NDArray[np.float64]:
+    centred = np.eye(6)
+    centred[3:, 3:] *= -1.0
+    centred[3:, :3] = -cross_matrix(rig_from_world.translation)
+    factors = np.repeat([orientation_factor, position_factor], 3)
+    widening = centred @ (factors[:, None] * centred)
+    widened = widening @ covariance @ widening.T
+    return np.asarray((widened + widened.T) / 2)
+
+
+# Of maps that were never tested: what is stated is the photo's part alone.
+PHOTO_ONLY = MapErrors(1.0, 1.0, Uncertainty.PHOTO_ONLY)

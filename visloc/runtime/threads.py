@@ -10,8 +10,6 @@ from contextlib import contextmanager
 from time import perf_counter
 from types import ModuleType
 
-import cv2
-
 _VARIABLE = "OMP_NUM_THREADS"  # torch and others read it when they are loaded
 
 
@@ -21,6 +19,8 @@ def use_threads(count: int) -> None:
     OpenVINO keeps those that its networks were compiled with. That costs nothing: its threads do
     not spin while they wait.
     """
+    import cv2  # the main process of the service does without it
+
     cv2.setNumThreads(count)
     os.environ[_VARIABLE] = str(count)
     torch = loaded_torch()
@@ -50,6 +50,8 @@ def loaded_torch() -> ModuleType | None:
 @contextmanager
 def threads(count: int) -> Iterator[None]:
     """Set the number of threads within the ``with`` block, of one thread of Python at a time."""
+    import cv2  # as above
+
     before, of_opencv, variable = count_of_threads(), cv2.getNumThreads(), os.environ.get(_VARIABLE)
     use_threads(count)
     try:

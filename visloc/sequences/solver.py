@@ -30,8 +30,7 @@ from visloc.localization.solving import (
     with_inliers,
 )
 from visloc.options import LEAST_PROBABILITY, LocalizeOptions
-from visloc.pose.covariance import with_origin
-from visloc.pose.motion import RelativeMotion, UncertainPose, link_from_motion
+from visloc.pose.motion import RelativeMotion, UncertainPose, link_from_motion, with_origin
 from visloc.priors import Priors
 from visloc.runtime.threads import timed
 from visloc.sequences.filling import MAX_GAP_S, Odometry, TimeUnit, TracedPose, fill_sequence

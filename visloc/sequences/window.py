@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 from visloc.geometry import Pose
 from visloc.options import RegistrationPreset
-from visloc.pose.covariance import PHOTO_ONLY, MapErrors
 from visloc.pose.generalized import GeneralizedPose, refine_generalized_pose
 from visloc.pose.motion import (
+    PHOTO_ONLY,
+    MapErrors,
     RelativeMotion,
     UncertainPose,
     link_from_motion,

@@ -13,7 +13,7 @@ from visloc.archive.places import circles_of, located
 from visloc.errors import refuse
 from visloc.geodesy import ground_distances
 from visloc.localization.acceptance.judge import measured_pose
-from visloc.pose.covariance import largest_std
+from visloc.pose.motion import largest_std
 from visloc.priors import HEIGHT_REACH, POSE_PRIOR_STDS, REACH, Priors
 from visloc.sets.frame import down_in_set
 from visloc.types import InstantAnswer

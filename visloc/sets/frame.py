@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from visloc.errors import refuse
 from visloc.geometry import Pose, Similarity
-from visloc.pose.covariance import moved_pose, position_covariance
+from visloc.pose.motion import moved_pose, position_covariance
 from visloc.priors import HeightBand, PosePrior, PositionPrior, Priors
 from visloc.types import CoarsePose, InstantAnswer, RigPose
 

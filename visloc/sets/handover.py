@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from visloc.archive import SetOutline
 from visloc.geometry import Pose, rotation_angle
 from visloc.localization.acceptance.judge import STDS, TIE_ANGLE, TIE_REACH_SHARE
-from visloc.pose.covariance import largest_std
-from visloc.pose.motion import default_motion_covariance
+from visloc.pose.motion import default_motion_covariance, largest_std
 from visloc.priors import PositionPrior
 from visloc.sequences.filling import Odometry
 

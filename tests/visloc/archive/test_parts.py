@@ -12,7 +12,7 @@ from visloc.archive import OwnTest, add_own_test, open_map, verify_map, write_te
 from visloc.archive.schema import MAX_WRONG_SCORES
 from visloc.errors import MapCorrupt
 from visloc.localization.map_view.constraints import MapGeometry
-from visloc.pose.covariance import PHOTO_ONLY
+from visloc.pose.motion import PHOTO_ONLY
 from visloc.types import Uncertainty
 
 GOOD: dict[str, Any] = {

@@ -21,7 +21,7 @@ from visloc.localization.solving import Look, Matches, SeenImage, Solved
 from visloc.matching.correspondences import Proposals
 from visloc.options import LocalizeOptions
 from visloc.photos.reading import read_photo
-from visloc.pose.covariance import moved_origin
+from visloc.pose.motion import moved_origin
 from visloc.priors import NO_PRIORS, PositionPrior, Priors
 from visloc.types import CameraSource, Reason
 

@@ -13,8 +13,8 @@ from visloc.geometry import Camera, Pose, center_covariance
 from visloc.localization.acceptance.gates import registration_for
 from visloc.localization.solving import Matches, Solved, measured_pose, solve_instant
 from visloc.options import LocalizeOptions
-from visloc.pose.covariance import MapErrors, with_origin
 from visloc.pose.generalized import GeneralizedPose
+from visloc.pose.motion import MapErrors, with_origin
 from visloc.pose.reprojection import normalized_rays
 from visloc.priors import (
     NO_PRIORS,

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from visloc.geometry import Camera, Pose
 from visloc.pose.camera_errors import PRIORS, CameraErrors, LensEvidence, find_camera_errors
-from visloc.pose.covariance import position_covariance
 from visloc.pose.generalized import refine_generalized_pose
-from visloc.pose.motion import moved
+from visloc.pose.motion import moved, position_covariance
 from visloc.pose.reprojection import MatchedView, project
 from visloc.types import CameraSource
 

@@ -12,8 +12,9 @@ from scipy.stats import chi2
 
 from samples.trajectories import stereo_rig
 from visloc.geometry import Camera, Pose
-from visloc.pose.covariance import pose_covariance, position_covariance, with_origin
+from visloc.pose.covariance import pose_covariance
 from visloc.pose.generalized import estimate_generalized_pose
+from visloc.pose.motion import position_covariance, with_origin
 from visloc.pose.refinement import LOSS_SCALE_PX
 from visloc.pose.reprojection import MatchedView, normalized_rays, project
 

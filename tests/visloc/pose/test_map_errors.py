@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from visloc.geometry import Pose, Similarity, center_covariance
-from visloc.pose.covariance import PHOTO_ONLY, MapErrors, moved_pose, position_covariance
+from visloc.pose.motion import PHOTO_ONLY, MapErrors, moved_pose, position_covariance
 from visloc.types import Uncertainty
 
 RANDOM = np.random.default_rng(0)

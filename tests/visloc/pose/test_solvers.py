@@ -13,13 +13,13 @@ from visloc.evaluation import pose_error
 from visloc.geometry import CAMERA_MODELS, Camera, Pose, center_covariance
 from visloc.localization.solving import SeenImage, Solved, solve_instant
 from visloc.options import LocalizeOptions, Solver
-from visloc.pose.covariance import MapErrors
 from visloc.pose.generalized import (
     SOLVERS,
     GeneralizedPose,
     estimate_generalized_pose,
     refine_generalized_pose,
 )
+from visloc.pose.motion import MapErrors
 from visloc.pose.reprojection import MatchedView, normalized_rays
 from visloc.priors import GravityPrior, Priors
 from visloc.types import CameraSource, Reason

@@ -14,7 +14,7 @@ from visloc.errors import InvalidInput
 from visloc.geometry import Camera, Pose, center_covariance
 from visloc.localization.solving import Matches, SeenImage, solve_instant
 from visloc.options import LocalizeOptions
-from visloc.pose.covariance import MapErrors
+from visloc.pose.motion import MapErrors
 from visloc.priors import NO_PRIORS, HeightBand, PositionPrior, Priors
 from visloc.sequences import solver as sequence_module
 from visloc.sequences.filling import MAX_GAP_S, Odometry, TimeUnit

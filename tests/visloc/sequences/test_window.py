@@ -16,9 +16,15 @@ from scipy.stats import chi2
 from visloc.evaluation import pose_error
 from visloc.geometry import Camera, Pose, covariance_from_center
 from visloc.options import PRESETS, RegistrationPreset
-from visloc.pose.covariance import PHOTO_ONLY, MapErrors, pose_covariance, position_covariance
+from visloc.pose.covariance import pose_covariance
 from visloc.pose.generalized import GeneralizedPose, refine_generalized_pose
-from visloc.pose.motion import RelativeMotion, default_motion_covariance
+from visloc.pose.motion import (
+    PHOTO_ONLY,
+    MapErrors,
+    RelativeMotion,
+    default_motion_covariance,
+    position_covariance,
+)
 from visloc.pose.refinement import LOSS_SCALE_PX
 from visloc.pose.reprojection import MatchedView, project
 from visloc.sequences.window import WindowInstant, WindowPose, solve_window

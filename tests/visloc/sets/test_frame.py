@@ -12,7 +12,8 @@ from visloc.errors import InvalidInput
 from visloc.geometry import Camera, Pose, Similarity
 from visloc.localization.map_view.constraints import Constraints
 from visloc.options import ReadAs
-from visloc.pose.covariance import mahalanobis2, moved_pose, position_covariance
+from visloc.pose.covariance import mahalanobis2
+from visloc.pose.motion import moved_pose, position_covariance
 from visloc.priors import (
     NO_PRIORS,
     GnssPrior,

@@ -19,8 +19,9 @@ from visloc.localization.acceptance.gates import Problem, asks_for_weak_poses
 from visloc.localization.acceptance.judge import TIE_ANGLE, TIE_REACH_SHARE
 from visloc.options import Solver
 from visloc.pose.camera_errors import PRIORS, LensEvidence, find_camera_errors
-from visloc.pose.covariance import largest_std, normalized_distance2
+from visloc.pose.covariance import normalized_distance2
 from visloc.pose.generalized import GeneralizedPose, refine_generalized_pose
+from visloc.pose.motion import largest_std
 from visloc.pose.reprojection import MatchedView, reprojection_errors
 from visloc.types import Reason, Refusal, Uncertainty
 

@@ -20,7 +20,7 @@ from scipy.spatial import KDTree
 from visloc.geometry import Camera, Pose
 from visloc.localization.map_view.constraints import MapGeometry
 from visloc.matching.products import EightBitRows
-from visloc.pose.covariance import position_covariance
+from visloc.pose.motion import position_covariance
 from visloc.pose.reprojection import MatchedView, project, reprojection_errors
 
 # How many mapping photos stand for a camera at the pose; landmarks of each, and of all.

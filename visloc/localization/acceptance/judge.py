@@ -16,7 +16,7 @@ import numpy as np
 from visloc.geometry import Similarity, rotation_angle
 from visloc.localization.acceptance.preference import preference
 from visloc.options import LocalizeOptions
-from visloc.pose.covariance import largest_std, moved_pose, position_covariance
+from visloc.pose.motion import largest_std, moved_pose, position_covariance
 from visloc.types import Candidate, InstantAnswer, Reason, Refusal, RigPose
 
 # As shares of the most inliers. All answers above the first share must agree, or the result is

@@ -31,8 +31,8 @@ from visloc.localization.acceptance.preference import SURE, preference
 from visloc.localization.map_view.constraints import MapGeometry
 from visloc.matching.correspondences import Proposals, propose_landmarks
 from visloc.matching.products import round_descriptors
-from visloc.pose.covariance import largest_std, moved_origin
 from visloc.pose.generalized import GeneralizedPose, refine_generalized_pose
+from visloc.pose.motion import largest_std, moved_origin
 from visloc.pose.reprojection import MatchedView, reprojection_errors
 from visloc.pose.search import MAX_TRIALS, search_with_pycolmap
 from visloc.types import Candidate, LocalFeatures, Reason, Refusal

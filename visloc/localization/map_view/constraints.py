@@ -21,16 +21,10 @@ from visloc.features.resolution import Resolution, WorkingResolution
 from visloc.geometry import Pose
 from visloc.localization.map_view.local_model import LocalModel
 from visloc.matching.products import EightBitRows
-from visloc.pose.covariance import (
-    PHOTO_ONLY,
-    MapErrors,
-    largest_std,
-    mahalanobis2,
-    viewpoints_apart,
-    with_origin,
-)
+from visloc.pose.covariance import mahalanobis2, viewpoints_apart
 from visloc.pose.generalized import MAX_FOCAL, MIN_FOCAL
 from visloc.pose.gravity import KnownGravity, gravity_deviation
+from visloc.pose.motion import PHOTO_ONLY, MapErrors, largest_std, with_origin
 from visloc.pose.reprojection import MatchedView, normalized_rays
 from visloc.priors import HEIGHT_REACH, POSE_PRIOR_STDS, REACH, GnssPrior, Priors
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from tests.visloc.answers import localized, refused
 from visloc.geometry import Similarity
 from visloc.localization.acceptance.judge import PlaceAnswer, Tie, judge
-from visloc.pose.covariance import moved_pose
+from visloc.pose.motion import moved_pose
 from visloc.sets.frame import answer_in_set
 from visloc.types import Reason, Refusal
 
