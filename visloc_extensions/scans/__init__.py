@@ -1,6 +1,7 @@
 """Importers of scans of phones with poses of ARKit, as apps write them.
 
-Here: whose scan a folder is, which keeps it from being taken for photos or a dataset.
+Here: whose scan a folder is, which keeps it from being taken for photos or a dataset. It needs the
+extension ``films``.
 """
 
 from __future__ import annotations
