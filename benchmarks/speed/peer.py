@@ -12,7 +12,6 @@ from benchmarks.speed.dataset import Bench, read_errors
 from benchmarks.speed.steps import say
 from visloc.errors import Conflict
 from visloc.options import Inference
-from visloc_extensions.research.export_features import export_features
 
 # As builds of ours have it.
 _MAX_KEYPOINTS = 5000
@@ -38,6 +37,9 @@ def export_for_peer(bench: Bench) -> None:
 
 
 def _export(bench: Bench) -> None:
+    # Only this step needs the extension.
+    from visloc_extensions.research.export_features import export_features
+
     for side in ("mapping", "query"):
 
         def progress(_stage: str, done: int, total: int, side: str = side) -> None:
