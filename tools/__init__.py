@@ -1,1 +1,1 @@
-"""What the repository needs beside the product: its site, its supply chain, its sizes."""
+"""Commands that maintain the repository: its site, supply chain, sizes, and the core alone."""

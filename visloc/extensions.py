@@ -1,4 +1,4 @@
-"""What extensions add: entry points of installed packages, ``visloc_extensions`` among them.
+"""Finds and loads what extensions add, by the entry points of installed packages.
 
 An extension registers each thing that it adds with a line in its package's metadata, for ours in
 ``pyproject.toml``: the group says what it is, the name is the one that users give, and the value

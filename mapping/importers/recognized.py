@@ -1,4 +1,4 @@
-"""What extensions recognise as theirs, where photos or a dataset are expected."""
+"""Asks extensions whether a path that was given as photos or a dataset is of a format of theirs."""
 
 from __future__ import annotations
 

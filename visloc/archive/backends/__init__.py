@@ -1,1 +1,1 @@
-"""Where a store keeps its maps: a folder."""
+"""Backends of a store of maps; the one here keeps them in a folder."""
