@@ -14,9 +14,10 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from dataclasses import asdict
+from itertools import chain, islice
 from pathlib import Path
 from time import perf_counter
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import typer
 
@@ -27,6 +28,8 @@ from benchmarks.trust.outcomes import Outcome
 from benchmarks.trust.pictures import ask_and_draw
 from benchmarks.trust.scenarios import FLOOR_SET, NEEDED, SCENARIOS, floor_set
 from benchmarks.trust.table import write_tables
+
+_Asked = TypeVar("_Asked")
 
 
 def main(
@@ -45,6 +48,9 @@ def main(
         Path | None, typer.Option(help="Gets a picture of each photo that is wrongly believed.")
     ] = None,
     weights_dir: Path | None = None,
+    resume: Annotated[
+        bool, typer.Option(help="Keep the answers of a run of the same code that was stopped.")
+    ] = False,
 ) -> None:
     """Run the scenarios, and print the tables."""
     chosen = only or list(NEEDED)
@@ -63,13 +69,16 @@ def main(
     outcomes: list[Outcome] = []
     for name in chosen:
         started = perf_counter()
+        path = answers_dir / f"{name}.jsonl"
+        before = list(outcomes_in(path)) if resume and path.exists() else []
         if name == FLOOR_SET:
-            found = ask_floors(places.store, weights_dir, floor_set(places))
+            found = ask_floors(places.store, weights_dir, _after(before, floor_set(places)))
         elif pictures is None:
-            found = maps.ask(SCENARIOS[name](places))
+            found = maps.ask(_after(before, SCENARIOS[name](places)))
         else:
-            found = ask_and_draw(maps, SCENARIOS[name](places), places, pictures / name)
-        outcomes += kept(found, answers_dir / f"{name}.jsonl")
+            queries = _after(before, SCENARIOS[name](places))
+            found = ask_and_draw(maps, queries, places, pictures / name)
+        outcomes += kept(chain(before, found), path)
         typer.echo(f"{name}: {perf_counter() - started:.0f} s", err=True)
     for line in write_tables(outcomes):
         typer.echo(line)
@@ -83,6 +92,20 @@ def kept(outcomes: Iterator[Outcome], path: Path) -> list[Outcome]:
             lines.write(json.dumps(asdict(outcome)) + "\n")
             seen.append(outcome)
     return seen
+
+
+def outcomes_in(path: Path) -> Iterator[Outcome]:
+    """Read the outcomes that ``kept`` wrote, up to a line that was cut off."""
+    for line in path.read_text(encoding="utf-8").splitlines():
+        try:
+            yield Outcome(**json.loads(line))
+        except json.JSONDecodeError:
+            return
+
+
+def _after(before: list[Outcome], queries: Iterator[_Asked]) -> Iterator[_Asked]:
+    """Leave out the queries that were answered; a scenario asks in the same order each time."""
+    return islice(queries, len(before), None)
 
 
 if __name__ == "__main__":
