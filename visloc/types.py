@@ -276,44 +276,6 @@ class Evidence:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Localized:
-    """A pose that passed the gate.
-
-    Attributes:
-        evidence: what led to it.
-        cam_from_world: the pose.
-        covariance: (6, 6) float64 of rotation (rad) then translation, for R <- Exp(w) R and
-            t <- t + dt of ``cam_from_world``: the photo's part, widened by the errors of the map
-            as far as ``uncertainty`` says.
-        position_std: (3,) standard deviations of the camera centre along the world's axes.
-        orientation_std: (3,) standard deviations of w (rad), about the camera's x, y, z.
-        inlier_keypoints: (N, 2) float32 pixels of the photo as stored.
-        inlier_points: (N, 3) float64 in the world.
-        photo_covariance: (6, 6) float64, the photo's part of ``covariance``: what the scatter of
-            its own measurements and the errors of its camera leave open.
-        uncertainty: what ``covariance`` covers.
-        probability: that the pose is right, 0 to 1 (docs/decisions/0029-evidence-against.md); None
-            when the photo's features were not compared with the map around the pose.
-    """
-
-    evidence: Evidence
-    cam_from_world: Pose
-    covariance: NDArray[np.float64]
-    position_std: NDArray[np.float64]
-    orientation_std: NDArray[np.float64]
-    inlier_keypoints: NDArray[np.float32]
-    inlier_points: NDArray[np.float64]
-    photo_covariance: NDArray[np.float64]
-    uncertainty: Uncertainty
-    probability: float | None = None
-
-    @property
-    def status(self) -> Literal["localized"]:
-        """The word of the API."""
-        return "localized"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
     """One of the places between which an ambiguous query leaves the choice.
 
@@ -356,35 +318,6 @@ class CoarsePose:
     method: CoarseMethod
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class NotLocalized:
-    """The map was searched and gave no pose that can be trusted.
-
-    Attributes:
-        evidence: how far it came.
-        stage: the stage that gave up.
-        reason: why, as a stable word.
-        message: why, for a person.
-        candidates: the places of an ambiguous photo that have a pose; () otherwise.
-        coarse: a pose told by retrieval alone, if the query asked for one.
-    """
-
-    evidence: Evidence
-    stage: Stage
-    reason: Reason
-    message: str
-    candidates: tuple[Candidate, ...] = ()
-    coarse: CoarsePose | None = None
-
-    @property
-    def status(self) -> Literal["coarse", "not_localized"]:
-        """The word of the API."""
-        return "not_localized" if self.coarse is None else "coarse"
-
-
-Answer = Localized | NotLocalized
-
-
 @dataclass(frozen=True, slots=True)
 class Refusal:
     """Why the images of an instant gave no pose.
@@ -417,8 +350,9 @@ class RigPose:
             instant's own images and the errors of their cameras leave open; None for a pose that
             they did not measure.
         uncertainty: what ``covariance`` covers.
-        probability: that the pose is right, 0 to 1, judged by the instant's own images; None when
-            they did not measure it, or only with the help of other instants.
+        probability: that the pose is right, 0 to 1 (docs/decisions/0029-evidence-against.md),
+            judged by the instant's own images; None when they did not measure it, or only with the
+            help of other instants, or were not compared with the map around the pose.
     """
 
     rig_from_world: Pose
@@ -429,6 +363,93 @@ class RigPose:
     photo_covariance: NDArray[np.float64] | None
     uncertainty: Uncertainty
     probability: float | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Localized:
+    """A photo's pose that passed the gate: the pose of the rig of one camera that it is.
+
+    Attributes:
+        evidence: what led to it.
+        pose: as its own measurements gave it; the properties below read it as a camera's.
+        inlier_keypoints: (N, 2) float32 pixels of the photo as stored.
+        inlier_points: (N, 3) float64 in the world.
+    """
+
+    evidence: Evidence
+    pose: RigPose
+    inlier_keypoints: NDArray[np.float32]
+    inlier_points: NDArray[np.float64]
+
+    @property
+    def status(self) -> Literal["localized"]:
+        """The word of the API."""
+        return "localized"
+
+    @property
+    def cam_from_world(self) -> Pose:
+        """The pose of the camera."""
+        return self.pose.rig_from_world
+
+    @property
+    def covariance(self) -> NDArray[np.float64]:
+        """(6, 6) of ``cam_from_world``, as ``RigPose`` has it."""
+        return self.pose.covariance
+
+    @property
+    def position_std(self) -> NDArray[np.float64]:
+        """(3,) standard deviations of the camera centre along the world's axes."""
+        return self.pose.position_std
+
+    @property
+    def orientation_std(self) -> NDArray[np.float64]:
+        """(3,) standard deviations of w (rad), about the camera's x, y, z."""
+        return self.pose.orientation_std
+
+    @property
+    def photo_covariance(self) -> NDArray[np.float64]:
+        """(6, 6), the photo's part of ``covariance``: all of it but the errors of the map."""
+        assert self.pose.photo_covariance is not None  # the photo measured it
+        return self.pose.photo_covariance
+
+    @property
+    def uncertainty(self) -> Uncertainty:
+        """What ``covariance`` covers."""
+        return self.pose.uncertainty
+
+    @property
+    def probability(self) -> float | None:
+        """That the pose is right, 0 to 1; None when nothing was compared around the pose."""
+        return self.pose.probability
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NotLocalized:
+    """The map was searched and gave no pose that can be trusted.
+
+    Attributes:
+        evidence: how far it came.
+        stage: the stage that gave up.
+        reason: why, as a stable word.
+        message: why, for a person.
+        candidates: the places of an ambiguous photo that have a pose; () otherwise.
+        coarse: a pose told by retrieval alone, if the query asked for one.
+    """
+
+    evidence: Evidence
+    stage: Stage
+    reason: Reason
+    message: str
+    candidates: tuple[Candidate, ...] = ()
+    coarse: CoarsePose | None = None
+
+    @property
+    def status(self) -> Literal["coarse", "not_localized"]:
+        """The word of the API."""
+        return "not_localized" if self.coarse is None else "coarse"
+
+
+Answer = Localized | NotLocalized
 
 
 @dataclass(frozen=True, slots=True, eq=False)

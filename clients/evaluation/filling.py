@@ -87,12 +87,14 @@ def photo_result(result: InstantResult, index: int) -> LocalizeResult:
     if (traced := _measured_by(result, image)) is not None:
         assert result.pose is not None  # it was measured
         photo, turn = result.pose.photo_covariance, _turned_into(image, result.pose)
-        pose = pose_as_json(traced) | {
+        pose = {
+            **result.raw["pose"],  # what it has beyond the fields of the next line
+            **pose_as_json(traced),
             "cam_from_world": raw["cam_from_world"],
             "photo_covariance": [] if photo is None else (turn @ photo @ turn.T).ravel().tolist(),
             "probability": result.pose.probability,
-            "metric": result.pose.metric,
         }
+        del pose["rig_from_world"]
     elif result.localized:
         status = "not_localized"
         refusal = {

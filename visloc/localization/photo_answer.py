@@ -37,14 +37,8 @@ def photo_answer(
         return NotLocalized(evidence, *told, coarse=answer.coarse), inliers
     localized = Localized(
         evidence=evidence,
-        cam_from_world=pose.rig_from_world,
-        covariance=pose.covariance,
-        position_std=pose.position_std,
-        orientation_std=pose.orientation_std,
+        pose=pose,
         inlier_keypoints=(look.matches.pixels[inliers] * look.reduced).astype(np.float32),
         inlier_points=look.matches.points[inliers] + origin,
-        photo_covariance=pose.photo_covariance,
-        uncertainty=pose.uncertainty,
-        probability=pose.probability,
     )
     return localized, inliers
