@@ -10,7 +10,7 @@ PAGE_SOURCES := $(shell find web/src web/client/src web/*.html web/*.json web/cl
 .DEFAULT_GOAL := help
 # Vite needs this much; without it the service has no page, and says so.
 NODE_IS_THERE = command -v npm >/dev/null && node -e 'const [a, b] = process.versions.node.split(".").map(Number); process.exit(a > 22 || (a === 22 && b >= 12) || (a === 20 && b >= 19) ? 0 : 1)'
-.PHONY: help install apart size licences-check page check-page browser balancer promtool demo test test-all docs-check docs-errors docs-options licences lock sbom audit fuzz fuzz-api train-smoke bench bench-gpu bench-scale bench-change results trust fmt lint types contracts proto proto-check site docs-links check serve clean
+.PHONY: help install apart size licences-check page check-page browser balancer promtool demo test test-core test-extensions test-slow docs-check docs-errors docs-options licences lock sbom audit fuzz fuzz-api train-smoke bench bench-gpu bench-scale bench-change results trust fmt lint types contracts proto proto-check site docs-links check serve clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "%-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -73,11 +73,17 @@ promtool:
 demo: install ## the main job on a synthetic sample: build, serve, localize, picture
 	$(BIN)/python examples/demo.py
 
-test: install browser balancer promtool ## the tests, in about twelve minutes on two cores
-	$(BIN)/pytest -m 'not slow' --numprocesses 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 1
+test: test-core test-extensions ## the tests, in about twelve minutes on two cores
 
-test-all: install browser balancer promtool ## the slow tests too
-	$(BIN)/pytest
+test-core: install browser balancer promtool ## the core's tests, in a copy without extensions
+	$(BIN)/python -m tools.apart --all --only tests
+
+test-extensions: install ## the tests of the extensions, and of what the docs say
+	$(BIN)/pytest -m 'not slow' --numprocesses 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 1 \
+		visloc_extensions tests/test_docs.py
+
+test-slow: install browser balancer promtool ## the slow tests
+	$(BIN)/pytest -m slow
 
 apart: install ## the core's checks and tests without each extension in turn: NAMES
 	$(BIN)/python -m tools.apart $(NAMES) $(ARGS)
