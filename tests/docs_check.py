@@ -183,7 +183,6 @@ RULES = (
         for pattern in (
             r"mapping build castle/mapping --map castle-xfeat",
             r"python -m benchmarks\.retrieval",
-            r"python benchmarks/after_the_pose",
             r".*--map gallery",
             r"visloc-service --maps-dir \S+$",
             r"cp |sed ",

@@ -34,15 +34,11 @@ class Table:
 
 _SFM = ("--method", "sfm", "--pairs", "distance")
 _BARE = ("--method", "retrieval-only")
-_SETS = ("castle", "kitti_curve", "redkitchen")
-_AFTER = "benchmarks/after_the_pose.py"
 
 MAPS: Mapping[str, Build] = {
     "castle": Build("castle", _SFM),
     "castle-bare": Build("castle", _BARE),
     "gardenspoint-bare": Build("gardenspoint", (*_BARE, "--not-metric")),
-    "kitti_curve": Build("kitti_curve", _SFM),
-    "redkitchen": Build("redkitchen"),
 }
 
 
@@ -71,11 +67,4 @@ TABLES: Mapping[str, Table] = {
         "castle", "sfm:distance", "sfm:retrieval", "sfm:frustum", "sfm:covisibility"
     ),
     "pairings-10000": Table({"": ("benchmarks/pairing.py",)}),
-    "after-the-pose": Table(
-        {each: (_AFTER, f"MAPS/{each}", f"DATA/{each}/query") for each in _SETS},
-        _SETS,
-    ),
-    "ready-made-rounding": Table(
-        {"": ("-m", "benchmarks.ready_made_rounding", "DATA/virtual_gallery")}
-    ),
 }
