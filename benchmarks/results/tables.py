@@ -66,5 +66,4 @@ TABLES: Mapping[str, Table] = {
     "castle-pairings": _ways(
         "castle", "sfm:distance", "sfm:retrieval", "sfm:frustum", "sfm:covisibility"
     ),
-    "pairings-10000": Table({"": ("benchmarks/pairing.py",)}),
 }
