@@ -29,7 +29,6 @@ from unittest.mock import patch
 import numpy as np
 import typer
 
-from benchmarks.joining import SETTINGS
 from benchmarks.moving import write_photos
 from benchmarks.trust.maps import VIDEOS
 from mapping.cluster.workers import Workers
@@ -54,6 +53,7 @@ from visloc.geometry import PixelOrigin, Pose, rotation_angle
 from visloc.kapture import read_dataset
 from visloc.options import Inference
 
+SETTINGS = SfmSettings(pairs=("retrieval", "sequence"), poses="estimate")
 OF_PHOTOS = SfmSettings(poses="estimate", refine=("intrinsics",))
 WRONG_SHARE, WRONG_DEG = 0.1, 5.0
 METHODS, SPARSE = "mapping.methods", "mapping.methods.sparse"

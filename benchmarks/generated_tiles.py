@@ -14,7 +14,8 @@ the unit vector along a sum of independent parts:
 
 A query is one more photo, a metre beside a pass. The directions of the parts have the variances of
 the real photos in ``tile_similarities.json``, their lengths are chosen here so that the quantiles
-there come out (``benchmarks.tiles`` prints both).
+there come out (``benchmarks.tiles`` prints both). That file was measured with
+``benchmarks/tile_similarities.py`` of commit f776606b (docs/scale.md).
 """
 
 from __future__ import annotations
@@ -28,12 +29,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.tile_similarities import NAMES, centroids_of, quantiles
 from mapping.maps.coarse_model import random_rotation
 from visloc.features.descriptors.whitening import unit_rows
+from visloc.retrieval.inverted import MadeLists
 from visloc.sets.coarse import CoarseModel, described
 
 SIMILARITIES = Path(__file__).parent / "tile_similarities.json"
+# Of the quantiles in that file, and what is compared (docs/scale.md).
+LEVELS = (0.01, 0.1, 0.5, 0.9, 0.99, 0.999, 0.9999)
+NAMES = ("nearest", "co-visible", "apart", "elsewhere", "own centroids", "other centroids")
 PASSES = 8
 NEIGHBOURHOOD = 4
 # Share of a photo's squared length that the next photo of the same place shows too: from the first
@@ -173,7 +177,7 @@ class _Look:
 def similarities(
     city: City, tiles: Sequence[int], model: CoarseModel, queries: int = 4
 ) -> dict[str, list[float]]:
-    """Return quantiles of the same similarities as ``tile_similarities``.
+    """Return quantiles, at ``LEVELS``, of the same similarities as in ``SIMILARITIES``.
 
     Photos of the same pass stand for co-visible ones, those of the other passes for photos apart;
     elsewhere are tiles of other neighbourhoods.
@@ -195,7 +199,15 @@ def similarities(
             found["elsewhere"].append((tile.queries @ some.T).ravel())
             closest = (tile.queries @ centroids[other].T).max(axis=1)
             found["other centroids"].append(closest)
-    return {name: quantiles([np.concatenate(some)]) for name, some in found.items()}
+    return {
+        name: np.quantile(np.concatenate(some), LEVELS, method="inverted_cdf").round(4).tolist()
+        for name, some in found.items()
+    }
+
+
+def centroids_of(tile: MadeLists, model: CoarseModel) -> Rows:
+    """Return the unit centres of a tile's lists as descriptors."""
+    return unit_rows(tile.centers) @ model["rotation"].T
 
 
 def generated_model(dim: int, words: int = 128, word_dim: int = 128) -> CoarseModel:

@@ -30,8 +30,13 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from benchmarks.generated_tiles import SIMILARITIES, City, generated_model, similarities
-from benchmarks.tile_similarities import table
+from benchmarks.generated_tiles import (
+    LEVELS,
+    SIMILARITIES,
+    City,
+    generated_model,
+    similarities,
+)
 from visloc.archive import (
     FingerprintRecord,
     SetContent,
@@ -203,12 +208,13 @@ def compared(city: City, model: CoarseModel) -> str:
     real = json.loads(SIMILARITIES.read_text())["quantiles"]
     tiles = np.unique(np.linspace(0, city.num_tiles - 1, COMPARED_TILES).astype(int)).tolist()
     made = similarities(city, tiles, model, QUERIES_OF_TILE)
-    both = [
-        (f"{name}, {kind}", values[name])
-        for name in real
-        for kind, values in (("real", real), ("generated", made))
-    ]
-    return table(both)
+    head = " | ".join(f"{100 * level:g} %" for level in LEVELS)
+    lines = [f"| cosines | {head} |", "|---" * (1 + len(LEVELS)) + "|"]
+    for name in real:
+        for kind, values in (("real", real), ("generated", made)):
+            cells = " | ".join(f"{value:.2f}" for value in values[name])
+            lines.append(f"| {name}, {kind} | {cells} |")
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":

@@ -182,7 +182,6 @@ RULES = (
         Rule(Tier.RUN, r"results\.md", pattern)
         for pattern in (
             r"mapping build castle/mapping --map castle-xfeat",
-            r"python -m benchmarks\.retrieval",
             r".*--map gallery",
             r"visloc-service --maps-dir \S+$",
             r"cp |sed ",

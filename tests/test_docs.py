@@ -315,7 +315,7 @@ def test_every_command_is_known_and_parses(page: Path) -> None:
             True,
             True,
         ),
-        ("python -m benchmarks.retrieval maps/ID", True, False),
+        ("python -m benchmarks.captures --no-such-flag", True, False),
         ("python benchmarks/no_such_file.py", True, False),
         ("visloc-service --no-such-flag", True, False),
         ("make no-such-target", True, False),

@@ -8,22 +8,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.generated_tiles import PASSES, SIMILARITIES, City, generated_model, similarities
-from benchmarks.tile_similarities import LEVELS, quantiles
+from benchmarks.generated_tiles import (
+    LEVELS,
+    PASSES,
+    SIMILARITIES,
+    City,
+    generated_model,
+    similarities,
+)
 from benchmarks.tiles import BLOCK_TILES, answers, make_set, write_queries
 from benchmarks.tiles_queries import WARM_UP
 from visloc.archive import verify_set
 from visloc.sets.coarse import MAX_RANKED
 
 MODEL = generated_model(len(City(1, PASSES).stds["within"]), words=2, word_dim=8)
-
-
-def test_quantiles_weigh_datasets_the_same_whatever_their_size() -> None:
-    few, many = np.zeros(3, np.float32), np.ones(3000, np.float32)
-    found = dict(zip(LEVELS, quantiles([few, many, many[:0]]), strict=True))
-    assert found[0.1] == 0.0
-    assert found[0.9] == 1.0
-    assert found[0.5] in (0.0, 1.0)
 
 
 def test_generated_photos_are_as_alike_as_real_ones() -> None:

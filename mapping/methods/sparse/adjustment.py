@@ -112,7 +112,7 @@ def adjusted_robustly(
 
     The mapper adjusts all photos by squared errors. Of the matches that fit the geometry of their
     two photos to a few pixels, one in twenty is wrong; squared, they outweigh the others, and bend
-    a model of few photos by centimetres in a room (``python -m benchmarks.joining small``).
+    a model of few photos by centimetres in a room (docs/results.md).
     Members of rigs do not move in them.
 
     A principal point that is two pixels off bends the paths of cameras too. It is refined last, of

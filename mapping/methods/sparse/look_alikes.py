@@ -36,7 +36,7 @@ from mapping.progress import ItemProgress, not_told
 # A keypoint is confirmed by a match with one of so many photos: those with most matches.
 _CONFIRMING = 4
 # Least share of confirmed keypoints that a pair must match: of photos next to each other in time,
-# at most so many steps, and of all others. Measured: benchmarks/joining.py.
+# at most so many steps, and of all others. Measured with benchmarks/joining.py of commit f776606b.
 _NEAR_STEPS = 3
 _LEAST_NEAR, _LEAST_FAR = 0.1, 0.3
 # Least share, counted in matches, of the pairs that pass among those of the neighbours of a pair's
