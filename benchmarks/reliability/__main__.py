@@ -23,11 +23,9 @@ from benchmarks.reliability.connections import Strength, behind_balancer, connec
 from benchmarks.reliability.heavy_requests import heavy_photos, many_values
 from benchmarks.reliability.kills import kill_service, kill_workers
 from benchmarks.reliability.maps import SampleMaps, make_maps
-from benchmarks.reliability.refusals import refusals
 from benchmarks.reliability.siege import siege
 from benchmarks.reliability.soak import soak
 from benchmarks.reliability.storage import s3_away
-from benchmarks.reliability.swaps import swaps
 from benchmarks.reliability.uploads import full_disk, truncated_upload
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, help=__doc__)
@@ -129,22 +127,6 @@ def siege_command(
     """All attacks at once on two replicas, with swaps, kills, and a replica replaced."""
     with _prepared() as (maps, work):
         print_checks("siege", asyncio.run(siege(maps, work, 60 * minutes)))
-
-
-@app.command("swaps")
-def swaps_command(
-    seconds: Annotated[float, typer.Option(help="How long.")] = 60.0,
-) -> None:
-    """Versions swapped, deleted and published without a pause, while workers are killed."""
-    with _prepared() as (maps, work):
-        print_checks("swaps", asyncio.run(swaps(maps, work, seconds)))
-
-
-@app.command("refusals")
-def refusals_command() -> None:
-    """Wrong keys, missing scopes, replayed and oversized bodies, path tricks."""
-    with _prepared() as (maps, work):
-        print_checks("refusals", refusals(maps, work))
 
 
 @contextmanager

@@ -25,7 +25,7 @@ from benchmarks.reliability.maps import (
     verify_store,
 )
 from benchmarks.reliability.service_process import ServiceProcess, is_alive
-from benchmarks.reliability.soak import Expected, unloaded_answers
+from benchmarks.reliability.soak import Expected, differing, unloaded_answers
 
 WORKER_DIED = frozenset({"500 server.worker_died", "INTERNAL server.worker_died"})
 AWAY = frozenset({"503 server.starting", "UNAVAILABLE server.starting"})
@@ -203,7 +203,7 @@ async def _change(service: ServiceProcess, maps: SampleMaps, stop: asyncio.Event
 
 
 def _retry_check(done: Sequence[Persisted], expected: Expected) -> Check:
-    wrong = [o for o in done if (o.outcome.status, o.outcome.body) not in expected[o.case.name]]
+    wrong = differing(done, expected)
     again = [one for one in done if one.errors]
     longest = max((one.seconds for one in again), default=0.0)
     return Check(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import random
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from time import perf_counter
 
@@ -15,36 +16,34 @@ RETRY_PAUSE_S = 0.5
 
 
 @dataclass(frozen=True)
-class Asked:
-    """A request and what came of it.
-
-    Attributes:
-        case: what was sent.
-        id: of the request.
-        at: when it was sent, by ``perf_counter``.
-        outcome: what came.
-    """
+class Answered:
+    """A request and what came of it."""
 
     case: Case
-    id: str
-    at: float
     outcome: Outcome
 
 
 @dataclass(frozen=True)
-class Persisted:
+class Asked(Answered):
+    """A request that was sent once.
+
+    Attributes:
+        id: of the request.
+    """
+
+    id: str
+
+
+@dataclass(frozen=True)
+class Persisted(Answered):
     """A request that was sent until it was answered.
 
     Attributes:
-        case: what was sent.
         errors: what came before the answer.
-        outcome: the answer.
         seconds: from the first attempt to the answer.
     """
 
-    case: Case
     errors: tuple[str, ...]
-    outcome: Outcome
     seconds: float
 
 
@@ -101,7 +100,7 @@ async def persist(
             while (outcome := await case.ask(doors)).is_lost or outcome.status in retried:
                 errors.append(outcome.status)
                 await asyncio.sleep(RETRY_PAUSE_S)
-            done.append(Persisted(case, tuple(errors), outcome, perf_counter() - started))
+            done.append(Persisted(case, outcome, tuple(errors), perf_counter() - started))
         return done
 
     answered = await asyncio.gather(*(client() for _ in range(clients)))
@@ -109,8 +108,15 @@ async def persist(
 
 
 async def _ask(doors: Doors, case: Case, id_: str) -> Asked:
-    at = perf_counter()
-    return Asked(case, id_, at, await case.ask(doors, id_))
+    return Asked(case, await case.ask(doors, id_), id_)
+
+
+async def stopped_within(stop: asyncio.Event, seconds: float) -> bool:
+    """Wait for an event for so long; whether it is set."""
+    with suppress(TimeoutError):
+        async with asyncio.timeout(seconds):
+            await stop.wait()
+    return stop.is_set()
 
 
 def percentile(values: Sequence[float], share: float) -> float:

@@ -17,15 +17,20 @@ from typing import Any
 
 import httpx
 
-from benchmarks.reliability.asking import Case, Doors, Outcome, good_cases
+from benchmarks.reliability.asking import Case, Doors, good_cases
 from benchmarks.reliability.attackers import ATTACKS, Assault, Attack, attacked
 from benchmarks.reliability.checks import Check, counts_text
 from benchmarks.reliability.heavy_requests import heavy_photo_requests, many_value_messages
-from benchmarks.reliability.load import RETRY_PAUSE_S, ask_in_turn, percentile
+from benchmarks.reliability.load import (
+    RETRY_PAUSE_S,
+    Persisted,
+    ask_in_turn,
+    percentile,
+    stopped_within,
+)
 from benchmarks.reliability.maps import SampleMaps, leftovers, verify_store
 from benchmarks.reliability.service_process import ServiceProcess
-from benchmarks.reliability.soak import Expected, unloaded_answers
-from benchmarks.reliability.swaps import told
+from benchmarks.reliability.soak import Expected, differing, unloaded_answers
 
 SHARE = 0.7  # of the capacity
 EVERY_S = 20.0  # swaps, kills, publications
@@ -34,22 +39,14 @@ _CAPACITY_S = 10.0
 _HOLDING, _FLOODING = 40, 1  # connections of each attack, to each replica
 _HEAVY_PAUSE_S = 2.0
 _WARM_SHARE = 1 / 3
+# The line of a request is written after its answer.
+_LOGGED_AFTER_S = 0.5
 _MIB = 2**20
 # What a client asks again after: nothing was worked on, or the other replica may answer.
 _AGAIN = (
     *("429", "503", "UNAVAILABLE", "RESOURCE_EXHAUSTED", "no answer"),
     *("500 server.worker_died", "INTERNAL server.worker_died"),
 )
-
-
-@dataclass(frozen=True)
-class Honest:
-    """One honest request: its answer, the tries before it, and the seconds of all."""
-
-    case: Case
-    outcome: Outcome
-    tries: tuple[str, ...]
-    seconds: float
 
 
 @dataclass
@@ -97,9 +94,9 @@ async def siege(maps: SampleMaps, work: Path, seconds: float) -> list[Check]:
 
 async def _ask(
     doors: Sequence[Doors], cases: Sequence[Case], rate: float, seconds: float
-) -> list[Honest]:
+) -> list[Persisted]:
     draw, started = random.Random(0), monotonic()
-    asking: list[asyncio.Task[Honest]] = []
+    asking: list[asyncio.Task[Persisted]] = []
     while (now := monotonic() - started) < seconds:
         due = len(asking) / rate
         if now < due:
@@ -109,14 +106,14 @@ async def _ask(
     return list(await asyncio.gather(*asking))
 
 
-async def _persist(doors: Sequence[Doors], case: Case) -> Honest:
+async def _persist(doors: Sequence[Doors], case: Case) -> Persisted:
     started, tries = monotonic(), list[str]()
     while True:
         outcome = await case.ask(doors[len(tries) % len(doors)])
         seconds = monotonic() - started
         # As long as the clients of the service do by default, and a little longer.
         if not outcome.status.startswith(_AGAIN) or seconds > 60:
-            return Honest(case, outcome, tuple(tries), seconds)
+            return Persisted(case, outcome, tuple(tries), seconds)
         tries.append(outcome.status)
         await asyncio.sleep(min(RETRY_PAUSE_S * len(tries), 4.0))
 
@@ -194,14 +191,14 @@ async def _change(
     async def change(method: str, path: str, **body: Any) -> str:
         replica, response = await _until_done(doors, method, path, **body)
         if response.status_code >= 500:
-            happened.faults.append(f"{method} {path}: {await told(response, replicas[replica])}")
+            happened.faults.append(f"{method} {path}: {await _told(response, replicas[replica])}")
         return str(response.status_code)
 
     async def use(map_id: str, version: str) -> None:
         path, body = f"/maps/{map_id}/current", {"version": version}
         happened.swaps[await change("POST", path, json=body)] += 1
 
-    while not await _stopped_within(stop, EVERY_S):
+    while not await stopped_within(stop, EVERY_S):
         number += 1
         await use("hall", maps.versions["hall"][number % 2])
         await use("room", first)
@@ -210,6 +207,14 @@ async def _change(
         added = await change("PUT", path, content=packed, headers=headers)
         happened.published[added] += 1
         await use("room", last)
+
+
+async def _told(response: httpx.Response, replica: ServiceProcess) -> str:
+    """Return an answer's body, and what the log of its replica says about it."""
+    await asyncio.sleep(_LOGGED_AFTER_S)
+    id_ = response.headers.get("x-request-id", "without an id")
+    lines = [line for line in replica.log.read_text(errors="replace").splitlines() if id_ in line]
+    return f"{response.status_code} {response.text.strip()}; log: {' '.join(lines) or 'nothing'}"
 
 
 async def _until_done(
@@ -230,7 +235,7 @@ async def _until_done(
 async def _kill_workers(
     replicas: Sequence[ServiceProcess], happened: Happened, stop: asyncio.Event
 ) -> None:
-    while not await _stopped_within(stop, EVERY_S):
+    while not await stopped_within(stop, EVERY_S):
         pids = replicas[happened.kills % len(replicas)].worker_pids
         if pids:
             with suppress(ProcessLookupError):
@@ -241,7 +246,7 @@ async def _kill_workers(
 async def _replace(
     replica: ServiceProcess, happened: Happened, stop: asyncio.Event, after_s: float
 ) -> None:
-    if not await _stopped_within(stop, after_s):
+    if not await stopped_within(stop, after_s):
         await asyncio.to_thread(replica.stop)
         replica.start()
         await asyncio.to_thread(replica.wait_until_ready)
@@ -250,19 +255,12 @@ async def _replace(
 
 async def _sample(replica: ServiceProcess, happened: Happened, stop: asyncio.Event) -> None:
     started = monotonic()
-    while not await _stopped_within(stop, 2.0):
+    while not await stopped_within(stop, 2.0):
         happened.memory.append((monotonic() - started, replica.resident_bytes()[0]))
 
 
-async def _stopped_within(stop: asyncio.Event, seconds: float) -> bool:
-    with suppress(TimeoutError):
-        async with asyncio.timeout(seconds):
-            await stop.wait()
-    return stop.is_set()
-
-
 def _checks(
-    honest: Sequence[Honest],
+    honest: Sequence[Persisted],
     expected: Expected,
     capacity: float,
     quiet: Sequence[float],
@@ -272,12 +270,8 @@ def _checks(
 ) -> list[Check]:
     unanswered = [one for one in honest if one.outcome.status.startswith(_AGAIN)]
     answered = [one for one in honest if not one.outcome.status.startswith(_AGAIN)]
-    wrong = [
-        one
-        for one in answered
-        if (one.outcome.status, one.outcome.body) not in expected[one.case.name]
-    ]
-    tries = Counter(status for one in honest for status in one.tries)
+    wrong = differing(answered, expected)
+    tries = Counter(status for one in honest for status in one.errors)
     took = [one.seconds for one in answered]
     warm = [size for at, size in happened.memory if at >= happened.memory[-1][0] * _WARM_SHARE]
     # The least of each half: what stays when no large request is under way.
@@ -286,7 +280,7 @@ def _checks(
         Check(
             "every honest request is answered in the end",
             f"{len(answered)} of {len(honest)}, at {SHARE:.0%} of {capacity:.1f}/s; "
-            f"{sum(bool(one.tries) for one in honest)} asked again ({counts_text(tries)}); p50 "
+            f"{sum(bool(one.errors) for one in honest)} asked again ({counts_text(tries)}); p50 "
             f"{percentile(took, 0.5):.2f} s, p90 {percentile(took, 0.9):.2f} s, longest "
             f"{max(took, default=0):.1f} s; alone p90 {percentile(quiet, 0.9):.2f} s",
             not unanswered,

@@ -13,7 +13,14 @@ import numpy as np
 
 from benchmarks.reliability.asking import Case, Doors, bad_cases, good_cases
 from benchmarks.reliability.checks import Check, counts_text
-from benchmarks.reliability.load import Asked, ask_at_rate, ask_in_turn, percentile
+from benchmarks.reliability.load import (
+    Answered,
+    Asked,
+    ask_at_rate,
+    ask_in_turn,
+    percentile,
+    stopped_within,
+)
 from benchmarks.reliability.maps import SampleMaps
 from benchmarks.reliability.service_process import ServiceProcess
 
@@ -74,16 +81,21 @@ async def unloaded_answers(doors: Doors, maps: SampleMaps, cases: Sequence[Case]
     return expected
 
 
+def differing(asked: Sequence[Answered], expected: Expected) -> list[Answered]:
+    """Return those whose answers are not among the unloaded ones."""
+    return [
+        one
+        for one in asked
+        if (one.outcome.status, one.outcome.body) not in expected[one.case.name]
+    ]
+
+
 def _answer_checks(
     asked: Sequence[Asked], expected: Expected, capacity: float, seconds: float
 ) -> list[Check]:
     busy = [one for one in asked if one.outcome.is_busy]
     accepted = [one for one in asked if not one.outcome.is_busy]
-    different = [
-        one
-        for one in accepted
-        if (one.outcome.status, one.outcome.body) not in expected[one.case.name]
-    ]
+    different = differing(accepted, expected)
     known = {status for answers in expected.values() for status, _ in answers}
     unexpected = Counter(
         one.outcome.status
@@ -163,7 +175,7 @@ async def _capacity(doors: Doors, cases: Sequence[Case]) -> float:
 async def _swap(doors: Doors, maps: SampleMaps, stop: asyncio.Event) -> Counter[str]:
     statuses: Counter[str] = Counter()
     count = 0
-    while not await _stopped_within(stop, SWAP_EVERY_S):
+    while not await stopped_within(stop, SWAP_EVERY_S):
         count += 1
         for number, (map_id, versions) in enumerate(maps.versions.items()):
             # So that every pair of versions comes up.
@@ -176,18 +188,9 @@ async def _swap(doors: Doors, maps: SampleMaps, stop: asyncio.Event) -> Counter[
 async def _sample(service: ServiceProcess, stop: asyncio.Event) -> list[tuple[float, int, int]]:
     started = time.monotonic()
     samples = []
-    while not await _stopped_within(stop, SAMPLE_EVERY_S):
+    while not await stopped_within(stop, SAMPLE_EVERY_S):
         samples.append((time.monotonic() - started, *service.resident_bytes()))
     return samples
-
-
-async def _stopped_within(stop: asyncio.Event, seconds: float) -> bool:
-    try:
-        async with asyncio.timeout(seconds):
-            await stop.wait()
-    except TimeoutError:
-        return False
-    return True
 
 
 def _worker_deaths(metrics: str) -> float:

@@ -24,7 +24,7 @@ from benchmarks.reliability.load import Asked, ask_in_turn, percentile
 from benchmarks.reliability.maps import SampleMaps, verify_store
 from benchmarks.reliability.s3_server import ACCOUNT, BUCKET
 from benchmarks.reliability.service_process import ServiceProcess, free_port
-from benchmarks.reliability.soak import Expected, unloaded_answers
+from benchmarks.reliability.soak import Expected, differing, unloaded_answers
 from visloc.archive import MapStore
 
 STORAGE_AWAY = "503 maps.storage_away"
@@ -187,11 +187,7 @@ async def _while_away(
     told = await _ask_for_changes(doors, world)
     asked = await asking
     ready = service.is_ready()
-    wrong = [
-        one
-        for one in asked
-        if (one.outcome.status, one.outcome.body) not in world.expected[one.case.name]
-    ]
+    wrong = differing(asked, world.expected)
     before = percentile([one.outcome.seconds for one in world.quiet], 0.9)
     during = percentile([one.outcome.seconds for one in asked], 0.9)
     statuses = Counter(status for status, _ in told)

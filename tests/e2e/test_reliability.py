@@ -13,7 +13,6 @@ from benchmarks.reliability.connections import Strength, connections
 from benchmarks.reliability.heavy_requests import heavy_photos
 from benchmarks.reliability.kills import kill_service, kill_workers
 from benchmarks.reliability.maps import SampleMaps, make_maps
-from benchmarks.reliability.refusals import refusals
 from benchmarks.reliability.siege import siege
 from benchmarks.reliability.uploads import full_disk, truncated_upload
 
@@ -64,10 +63,6 @@ def test_a_siege_costs_no_answer_and_no_publication(maps: SampleMaps, tmp_path: 
 
 def test_photos_that_take_long_keep_no_worker(maps: SampleMaps, tmp_path: Path) -> None:
     assert broken(heavy_photos(maps, tmp_path, deadline_s=0.05)) == []
-
-
-def test_refused_requests_read_and_write_nothing(maps: SampleMaps, tmp_path: Path) -> None:
-    assert broken(refusals(maps, tmp_path)) == []
 
 
 def test_nothing_stays_of_an_upload_that_breaks(maps: SampleMaps, tmp_path: Path) -> None:
