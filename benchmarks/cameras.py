@@ -39,9 +39,9 @@ from mapping.pipeline.build import build_map
 from mapping.pipeline.settings import BuildSettings
 from samples.render import render_photo
 from samples.scene import make_room
-from visloc.archive import Map, MapStore
-from visloc.features import make_global_descriptor, make_local_features
+from visloc.archive import Map
 from visloc.geometry import Camera, PixelOrigin, Pose, Similarity, rotation_angle
+from visloc.in_process import LocalMap, open_map
 from visloc.kapture import Dataset, FileRecord, read_dataset
 from visloc.localization.localizer import Localizer
 from visloc.localization.solving import SeenImage
@@ -63,14 +63,6 @@ ZOOM = 1.6
 # Of the spread of the photos, and degrees.
 RIGHT_SHARE, RIGHT_DEG = 0.02, 2.0
 Make = Callable[[NDArray[np.uint8], Camera], tuple[NDArray[np.uint8], Camera]]
-
-
-def localizer_of(opened: Map) -> Localizer:
-    """Return what localizes photos in a map, in this process."""
-    name = opened.manifest.local_features.fingerprint.name
-    return Localizer(
-        opened, make_local_features(name, None), partial(make_global_descriptor, weights_dir=None)
-    )
 
 
 class Row:
@@ -132,7 +124,7 @@ def _with_exif(source: Image.Image, path: Path, **tags: float) -> None:
 
 def exif(places: Places, scratch: Path) -> Iterator[Row]:
     """EXIF's focal length in whole millimetres, and none."""
-    localizer = localizer_of(places.store.open(SAMPLE))
+    localizer = open_map(SAMPLE, places.maps).localizer
     for millimetres in (None, 24, 25, 26):
         row = Row("no EXIF" if millimetres is None else f"EXIF {millimetres} mm")
         for source, _, truth in _queries(places):
@@ -144,7 +136,7 @@ def exif(places: Places, scratch: Path) -> Iterator[Row]:
 
 def zoom(places: Places, scratch: Path) -> Iterator[Row]:
     """Twofold digital zoom, which EXIF's focal length contains or not."""
-    localizer = localizer_of(places.store.open(SAMPLE))
+    localizer = open_map(SAMPLE, places.maps).localizer
     for millimetres in (25, 50):
         row = Row(f"digital zoom of 2, EXIF {millimetres} mm")
         for source, camera, truth in _queries(places):
@@ -202,7 +194,7 @@ CHANGES: dict[str, Make] = {
 
 def given(places: Places, scratch: Path) -> Iterator[Row]:
     """Cameras that the caller sends, not quite those of the pixels."""
-    localizer = localizer_of(places.store.open(SAMPLE))
+    localizer = open_map(SAMPLE, places.maps).localizer
     for name, make in CHANGES.items():
         row = Row(name)
         for source, camera, truth in _queries(places):
@@ -214,7 +206,7 @@ def given(places: Places, scratch: Path) -> Iterator[Row]:
 
 def sequence(places: Places, _: Path) -> Iterator[Row]:
     """A focal length so little off that one photo hardly tells: photos alone, and as a sequence."""
-    localizer = localizer_of(places.store.open(SAMPLE))
+    localizer = open_map(SAMPLE, places.maps).localizer
     for zoom_by in (1.0, 1.003, 1.005):
         name = f"focal length {100 * (zoom_by - 1):+.1f} %"
         solver = SequenceSolver(
@@ -251,7 +243,7 @@ MOTIONS = {
 
 def shutter(places: Places, scratch: Path) -> Iterator[Row]:
     """Rows that are read while the camera moves."""
-    localizer, room = localizer_of(places.store.open(SAMPLE)), make_room(0)
+    localizer, room = open_map(SAMPLE, places.maps).localizer, make_room(0)
     for name, (turn, aside, ahead) in MOTIONS.items():
         row = Row(f"20 ms, {name}")
         for _, camera, truth in _queries(places):
@@ -272,7 +264,7 @@ def shutter(places: Places, scratch: Path) -> Iterator[Row]:
 def exact(places: Places, _: Path) -> Iterator[Row]:
     """Right cameras."""
     for name in EXACT:
-        localizer, row = localizer_of(places.store.open(name)), Row(name)
+        localizer, row = open_map(name, places.maps).localizer, Row(name)
         dataset = read_dataset(places.dataset(name, "query"))
         if name == "virtual_gallery":
             dataset = dataset.with_pixels_from(PixelOrigin.CENTER)
@@ -315,14 +307,14 @@ def _poses(dataset: Dataset) -> dict[str, Pose]:
     return found
 
 
-def _map_of_photos(name: str, folder: Path, maps: Path) -> Map:
+def _map_of_photos(name: str, folder: Path, maps: Path) -> LocalMap:
     """Build a map of photos alone."""
     dataset = folder.parent / "dataset"
     write_imported(read_model("images", folder), dataset)
     sfm = SfmSettings(poses="estimate", refine=("intrinsics",))
     settings = BuildSettings(dataset, name, maps_dir=maps, method="sfm", sfm=sfm, workers=2)
     build_map(replace(settings, accept=True), lambda *_: None)
-    return MapStore(maps).open(name)
+    return open_map(name, maps)
 
 
 def _known_poses(opened: Map, truth: dict[str, Pose]) -> tuple[dict[str, Pose], Similarity, float]:
@@ -352,9 +344,9 @@ def held_out(places: Places, scratch: Path) -> Iterator[str]:
             if number % 5:
                 shutil.copy(path, folder / new)
         opened = _map_of_photos(name, folder, scratch / name / "maps")
-        in_map, to_truth, spread = _known_poses(opened, truth)
-        camera = next(iter(opened.cameras.values()))
-        localizer, told = localizer_of(opened), []
+        in_map, to_truth, spread = _known_poses(opened.archive, truth)
+        camera = next(iter(opened.archive.cameras.values()))
+        localizer, told = opened.localizer, []
         for sent in (None, camera):
             counts: Counter[str] = Counter()
             for path, new in list(zip(photos, names, strict=True))[::5]:
@@ -387,7 +379,9 @@ def zoomed_maps(places: Places, scratch: Path) -> Iterator[str]:
                 photo = photo.resize((w, h), box=(*inset, w - inset[0], h - inset[1]))
                 tags = {"FocalLengthIn35mmFilm": millimetres, "DigitalZoomRatio": ZOOM}
             _with_exif(photo, folder / new, **tags)
-        in_map, to_truth, spread = _known_poses(_map_of_photos(name, folder, scratch), truth)
+        in_map, to_truth, spread = _known_poses(
+            _map_of_photos(name, folder, scratch).archive, truth
+        )
         wrong = sum(
             not _is_right(to_truth.move(pose), truth[each], spread) for each, pose in in_map.items()
         )

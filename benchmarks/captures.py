@@ -1,6 +1,6 @@
 """Maps by `mapping capture`, against poses that are known.
 
-    python benchmarks/captures.py walk hallway drone --data ../shared/data
+    python -m benchmarks.captures walk hallway drone --data ../shared/data
 
 ``walk``: a film of a walk through the sample world, with 1 % noise and slight blur; queries of the
 sample after a rigid alignment, the size from one given length. ``hallway``: 51 photos of ie_tower
@@ -14,7 +14,6 @@ import math
 import subprocess
 import sys
 from collections.abc import Callable
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
@@ -32,13 +31,11 @@ from samples.scene import make_room
 from samples.trajectories import mapping_trajectory, stereo_rig
 from visloc.archive import Anchor, Map, MapStore
 from visloc.evaluation import pose_error
-from visloc.features import make_global_descriptor, make_local_features
 from visloc.geodesy import enu_from_geodetic
-from visloc.geometry import Camera, Pose, Similarity
+from visloc.geometry import Pose, Similarity
 from visloc.geopose import earth_covariance
+from visloc.in_process import LocalMap, open_map
 from visloc.kapture import read_dataset
-from visloc.localization.localizer import Localizer
-from visloc.options import LocalizeOptions
 from visloc.photos.reading import read_photo_file
 from visloc.types import Localized
 
@@ -47,7 +44,7 @@ WALK_FRAMES, WALK_PHOTOS = 300, 90
 HALLWAY = "lookalike/query/sensors/records_data/floor11"
 
 
-def capture(work: Path, map_id: str, *arguments: str) -> Map:
+def capture(work: Path, map_id: str, *arguments: str) -> LocalMap:
     """Make the map, unless it is there; a run that was killed goes on."""
     maps = work / "maps"
     if map_id not in MapStore(maps).ids():
@@ -59,17 +56,7 @@ def capture(work: Path, map_id: str, *arguments: str) -> Map:
             ],
             check=True,
         )
-    return MapStore(maps).open(map_id)
-
-
-def localized(opened: Map, path: Path, camera: Camera | None = None) -> Localized | None:
-    """Localize a photo in this process, with the default options."""
-    name = opened.manifest.local_features.fingerprint.name
-    localizer = Localizer(
-        opened, make_local_features(name, None), partial(make_global_descriptor, weights_dir=None)
-    )
-    answer = localizer.localize(read_photo_file(path), camera, LocalizeOptions())
-    return answer if isinstance(answer, Localized) else None
+    return open_map(map_id, maps)
 
 
 def frame_poses(opened: Map, rate: int) -> dict[int, Pose]:
@@ -99,7 +86,7 @@ def walk(work: Path, _: Path) -> str:
     length = float(np.linalg.norm(poses[first].center - poses[last].center))
     scale = ("--scale", "walk.mp4@1", "walk.mp4@11", f"{length:.4f}m")
     opened = capture(work, "walk", str(film), "--photos", str(WALK_PHOTOS), *scale)
-    found = frame_poses(opened, WALK_RATE)
+    found = frame_poses(opened.archive, WALK_RATE)
     similarity, both = aligned(found, dict(enumerate(poses)))
     mean = np.mean([found[i].center for i in both], axis=0)
     target = np.mean([poses[i].center for i in both], axis=0)
@@ -107,16 +94,16 @@ def walk(work: Path, _: Path) -> str:
     sample = work / "sample"
     if not sample.exists():
         write_sample(sample)
-    queries, errors = read_dataset(sample / "query"), []
-    for record in queries.images:
-        camera, truth = queries.sensors[record.sensor_id].camera, queries.pose(record)
-        answer = localized(opened, queries.path_of(record), camera)
-        if answer is not None and truth is not None:
-            errors.append(pose_error(rigid.move(answer.cam_from_world), truth))
+    results = opened.localize_folder(sample / "query")
+    errors = [
+        pose_error(rigid.move(each.pose), each.truth)
+        for each in results
+        if each.pose is not None and each.truth is not None
+    ]
     metres, degrees = np.array(errors).T
     return (
         f"walk: {len(found)} photos in the map, its size off by {similarity.scale - 1:+.2%}; "
-        f"{len(errors)} of {len(queries.images)} queries, median {100 * np.median(metres):.2f} cm, "
+        f"{len(errors)} of {len(results)} queries, median {100 * np.median(metres):.2f} cm, "
         f"{np.median(degrees):.3f} deg, worst {100 * metres.max():.2f} cm"
     )
 
@@ -128,7 +115,7 @@ def hallway(work: Path, data: Path) -> str:
     if not film.exists():
         encode_video(film, (read_photo_file(path).rgb for path in photos), rate=HALLWAY_RATE)
     opened = capture(work, "hallway", str(film))
-    found = frame_poses(opened, HALLWAY_RATE)
+    found = frame_poses(opened.archive, HALLWAY_RATE)
     given = read_dataset(data / "ie_tower" / "floor11_hallway_right" / "mapping")
     number = {path.name: i for i, path in enumerate(photos)}
     known = {
@@ -154,7 +141,7 @@ def hallway(work: Path, data: Path) -> str:
 def drone(work: Path, data: Path) -> str:
     """Photos of a drone against the positions that it noted."""
     opened = capture(work, "drone", str(data / "drone_beach" / "mapping"))
-    anchor = opened.manifest.world.anchor
+    anchor = opened.archive.manifest.world.anchor
     assert anchor is not None
     assert anchor.geodetic is not None
     place = anchor.geodetic
@@ -164,8 +151,8 @@ def drone(work: Path, data: Path) -> str:
     fixes = {fix.timestamp: np.array([fix.y, fix.x, fix.z]) for fix in queries.gnss}
     lines = []
     for image in queries.images:
-        answer = localized(opened, folder / image.name)
-        if answer is None:
+        answer = opened.localize(folder / image.name).answer
+        if not isinstance(answer, Localized):
             lines.append(f"{image.name} refused")
             continue
         error = (

@@ -1,6 +1,6 @@
 """Maps of one dataset made in several ways, side by side: landmarks, time, accuracy.
 
-    python benchmarks/map_methods.py DATASET rgbd sfm:retrieval sfm:distance sfm:frustum
+    python -m benchmarks.map_methods DATASET rgbd sfm:retrieval sfm:distance sfm:frustum
 
 DATASET holds ``mapping`` and ``query``, kapture datasets. Each way is a method, for sfm with its
 pairing. Maps are built in order and kept in --maps-dir; ``sfm:covisibility`` asks the first of
@@ -10,64 +10,24 @@ options. Prints a table in Markdown.
 
 from __future__ import annotations
 
-import time
-from dataclasses import dataclass, field, replace
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import typer
 
+from benchmarks.speed.building import Stopwatch
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.pipeline.build import build_map
 from mapping.pipeline.settings import BuildSettings
+from visloc import in_process
 from visloc.archive import Map, open_map
-from visloc.evaluation import pose_error
-from visloc.features import DEFAULT_LOCAL_FEATURES, make_global_descriptor, make_local_features
-from visloc.kapture import read_dataset
-from visloc.localization.localizer import Localizer
-from visloc.options import LocalizeOptions
-from visloc.photos.reading import read_photo_file
-from visloc.types import Localized
+from visloc.features import DEFAULT_LOCAL_FEATURES
 
 # Stages that depend on the way; features and global descriptors do not.
 STAGES = ("depth", "landmarks", "pairs", "matches", "verified", "triangulation")
 BINS = ((0.05, 5.0), (0.25, 2.0), (0.5, 5.0))
-
-
-@dataclass
-class Stopwatch:
-    """Seconds by stage, from what a build tells of its progress."""
-
-    seconds: dict[str, float] = field(default_factory=dict)
-    _since: float = field(default_factory=time.perf_counter)
-
-    def __call__(self, stage: str, done: int, total: int) -> None:
-        """Note the time since the last call under the stage."""
-        del done, total
-        now = time.perf_counter()
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._since
-        self._since = now
-
-
-def measure(opened: Map, query: Path, weights_dir: Path | None) -> tuple[int, np.ndarray]:
-    """Localize the queries; return how many there are, and the errors (n, 2) in m and degrees."""
-    name = opened.manifest.local_features.fingerprint.name
-    localizer = Localizer(
-        opened,
-        make_local_features(name, weights_dir),
-        partial(make_global_descriptor, weights_dir=weights_dir),
-    )
-    dataset = read_dataset(query)
-    errors = []
-    for record in dataset.images:
-        photo = read_photo_file(dataset.path_of(record))
-        camera, truth = dataset.sensors[record.sensor_id].camera, dataset.pose(record)
-        answer = localizer.localize(photo, camera, LocalizeOptions())
-        if isinstance(answer, Localized) and truth is not None:
-            errors.append(pose_error(answer.cam_from_world, truth))
-    return len(dataset.images), np.array(errors).reshape(-1, 2)
 
 
 def main(
@@ -103,14 +63,18 @@ def main(
         watch = Stopwatch()
         opened = open_map(build_map(settings, watch))
         first = first or opened
-        total, errors = measure(opened, dataset / "query", weights_dir)
+        results = in_process.open_map(opened.ref, maps_dir, weights_dir).localize_folder(
+            dataset / "query"
+        )
+        found = [result.pose_error for result in results if result.pose_error is not None]
+        errors = np.array(found).reshape(-1, 2)
         counts = opened.manifest.counts
         within = [int(((errors[:, 0] <= m) & (errors[:, 1] <= deg)).sum()) for m, deg in BINS]
         median = np.median(errors, axis=0) if len(errors) else np.full(2, np.nan)
         seconds = sum(watch.seconds.get(stage, 0.0) for stage in STAGES)
         typer.echo(
             f"| `{way}` | {counts.landmarks} | {counts.observations} | {seconds:.1f} | "
-            f"{len(errors)} of {total} | {' | '.join(map(str, within))} | "
+            f"{len(errors)} of {len(results)} | {' | '.join(map(str, within))} | "
             f"{median[0] * 100:.2f} cm, {median[1]:.3f} deg |"
         )
 

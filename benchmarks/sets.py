@@ -21,15 +21,14 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from benchmarks.engines import engine_of
 from mapping.maps.sets import publish_set
 from service.engine.engine import Engine
-from service.telemetry.metrics import Metrics
-from service.values import Localization, RigJob, WorkerSettings, photo_job
+from service.values import Localization, RigJob, photo_job
 from visloc.archive import MapStore
 from visloc.geometry import Similarity
 from visloc.kapture import read_dataset
 from visloc.options import LocalizeOptions
-from visloc.photos.reading import ImageLimits
 from visloc.types import Reason
 
 APART_M = 10_000.0
@@ -128,17 +127,7 @@ def main(
             for i, map_id in enumerate(given)
         ]
         publish_set(store, set_id, tiles, lambda *_: None)
-    limits = ImageLimits()
-    settings = WorkerSettings(
-        weights_dir=weights_dir,
-        threads=threads,
-        max_loaded_bytes=2**33,
-        max_images=16,
-        max_instants=1000,
-        max_image_bytes=limits.max_bytes,
-        max_image_pixels=limits.max_pixels,
-    )
-    engine = Engine(store, settings, workers=workers, metrics=Metrics(), on_overdue=lambda: None)
+    engine = engine_of(store, weights_dir, workers=workers, threads=threads)
     typer.echo(
         "| queries of | photos | localized by the own map | in the set: right tile | wrong tile "
         "| ambiguous | refused | others localized | p50 own map, ms | p50 set, ms | ratio |\n"

@@ -55,6 +55,7 @@ class ServiceProcess:
         before: words before the command, such as ``unshare``'s.
         environment: variables besides this process's own.
         certificate: PEM files of a certificate and its key, for TLS.
+        ready_within_s: after which it is taken for broken.
         settings: further settings, by name; None leaves the service's own default.
 
     Attributes:
@@ -71,9 +72,11 @@ class ServiceProcess:
         before: Sequence[str] = (),
         environment: Mapping[str, str] | None = None,
         certificate: tuple[Path, Path] | None = None,
+        ready_within_s: float = READY_WITHIN_S,
         **settings: object,
     ) -> None:
         self.http_port, self.grpc_port = ports or (free_port(), free_port())
+        self._ready_within_s = ready_within_s
         self.trust: bytes | None = None
         if certificate is not None:
             self.trust = certificate[0].read_bytes()
@@ -131,9 +134,10 @@ class ServiceProcess:
             RuntimeError: when it ended, or takes far too long.
         """
         started = time.monotonic()
+        end = started + self._ready_within_s
         while not self.is_ready():
             assert self._process is not None
-            if self._process.poll() is not None or time.monotonic() > started + READY_WITHIN_S:
+            if self._process.poll() is not None or time.monotonic() > end:
                 raise RuntimeError(f"the service does not come up:\n{self.log.read_text()[-3000:]}")
             time.sleep(0.1)
         return time.monotonic() - started

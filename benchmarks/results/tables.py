@@ -43,8 +43,8 @@ MAPS: Mapping[str, Build] = {
 
 
 def _ways(dataset: str, *ways: str) -> Table:
-    script = "benchmarks/map_methods.py"
-    return Table({"": (script, f"DATA/{dataset}", *ways, "--maps-dir", "WORK/ways")})
+    script = ("-m", "benchmarks.map_methods", f"DATA/{dataset}")
+    return Table({"": (*script, *ways, "--maps-dir", "WORK/ways")})
 
 
 def _local_sfm(map_id: str, dataset: str) -> Sequence[str]:

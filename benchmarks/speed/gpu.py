@@ -27,17 +27,16 @@ from benchmarks.speed.building import MAP_ID, build
 from benchmarks.speed.dataset import Bench, Error, make_bench, num_within
 from benchmarks.speed.load import ask_at_once
 from benchmarks.speed.machine import load_average, num_threads, this_machine
+from benchmarks.speed.queries import answer_to
 from benchmarks.speed.served import service
 from benchmarks.speed.steps import say
 from benchmarks.speed.tables import describe_machine, number, table
 from visloc.archive import MapStore, open_map
-from visloc.evaluation import pose_error
 from visloc.features import make_local_features
 from visloc.kapture import read_dataset
 from visloc.localization.localizer import Localizer
 from visloc.options import Extraction, Inference, LocalizeOptions
 from visloc.photos.reading import read_photo_file
-from visloc.types import Localized
 
 _NETWORKS = ("r2d2", "faster2d2", "xfeat")
 _SIZES = ((640, 480), (1024, 768), (1600, 1200))
@@ -103,22 +102,10 @@ def ask_here(bench: Bench, maps_dir: Path) -> dict[str, Any]:
     extractor = make_local_features(bench.features, bench.weights_dir, Inference.TORCH)
     localizer = Localizer(open_map(MapStore(maps_dir).folder(MAP_ID)), extractor)
     localizer.warm_up()
-    stages: list[dict[str, float]] = []
-    errors: list[Error | None] = []
-    for record in [*dataset.images[:_WARM_UPS], *dataset.images]:
-        camera, truth = dataset.sensors[record.sensor_id].camera, dataset.pose(record)
-        started = time.perf_counter()
-        photo = read_photo_file(dataset.path_of(record))
-        decoded = time.perf_counter()
-        answer = localizer.localize(photo, camera, LocalizeOptions())
-        ended = time.perf_counter()
-        spent = {"decode": decoded - started, **answer.evidence.seconds}
-        stages.append({**spent, "whole query": ended - started})
-        if isinstance(answer, Localized) and truth is not None:
-            errors.append(pose_error(answer.cam_from_world, truth))
-        else:
-            errors.append(None)
-    stages, errors = stages[_WARM_UPS:], errors[_WARM_UPS:]
+    records = [*dataset.images[:_WARM_UPS], *dataset.images]
+    asked = [answer_to(localizer, dataset, record, LocalizeOptions()) for record in records]
+    stages = [{**one["seconds"], "whole query": one["total"]} for one in asked[_WARM_UPS:]]
+    errors: list[Error | None] = [one["error"] for one in asked[_WARM_UPS:]]
     known = [error for error in errors if error is not None]
     return {
         "computed_with": extractor.computed_with,
@@ -145,10 +132,9 @@ def _ask_without_gpu(bench: Bench, maps_dir: Path) -> dict[str, Any]:
 def _ask_service(bench: Bench, maps_dir: Path, workers: int) -> dict[str, Any]:
     """A service of so many workers: one client, then many at once."""
     threads = max(1, num_threads() // workers)
-    settings = ["--workers", str(workers), "--threads-per-worker", str(threads)]
     free_before = torch.cuda.mem_get_info()[0]
-    with service(bench, maps_dir, settings) as url:
-        ask = partial(ask_at_once, url, MAP_ID, bench.query)
+    with service(bench, maps_dir, workers=workers, threads_per_worker=threads) as served:
+        ask = partial(ask_at_once, served.url, MAP_ID, bench.query)
         ask(_CLIENTS, _LOAD_S / 2)  # the first answers of a process are slower
         alone, many = ask(1, _LOAD_S / 2), ask(_CLIENTS, _LOAD_S)
         used = free_before - torch.cuda.mem_get_info()[0]

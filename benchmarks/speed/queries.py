@@ -98,23 +98,29 @@ class Queries:
         return described
 
     def _ask(self, way: Way, record: FileRecord, seed: int) -> dict[str, Any]:
-        dataset: Dataset = self._dataset
-        camera, truth = dataset.sensors[record.sensor_id].camera, dataset.pose(record)
         options = LocalizeOptions(extraction=way.extraction, seed=seed)
-        started = time.perf_counter()
-        photo = read_photo_file(dataset.path_of(record))
-        decoded = time.perf_counter()
-        answer = self._localizers[way].localize(photo, camera, options)
-        ended = time.perf_counter()
-        error = None
-        if isinstance(answer, Localized) and truth is not None:
-            error = pose_error(answer.cam_from_world, truth)
-        return {
-            "name": record.path,
-            "total": ended - started,
-            "seconds": {"decode": decoded - started, **answer.evidence.seconds},
-            "keypoints": answer.evidence.num_keypoints,
-            "correspondences": answer.evidence.num_correspondences,
-            "inliers": answer.evidence.num_inliers,
-            "error": error,
-        }
+        return answer_to(self._localizers[way], self._dataset, record, options)
+
+
+def answer_to(
+    localizer: Localizer, dataset: Dataset, record: FileRecord, options: LocalizeOptions
+) -> dict[str, Any]:
+    """Ask about one photo: its answer, with the seconds of each stage and the error."""
+    camera, truth = dataset.sensors[record.sensor_id].camera, dataset.pose(record)
+    started = time.perf_counter()
+    photo = read_photo_file(dataset.path_of(record))
+    decoded = time.perf_counter()
+    answer = localizer.localize(photo, camera, options)
+    ended = time.perf_counter()
+    error = None
+    if isinstance(answer, Localized) and truth is not None:
+        error = pose_error(answer.cam_from_world, truth)
+    return {
+        "name": record.path,
+        "total": ended - started,
+        "seconds": {"decode": decoded - started, **answer.evidence.seconds},
+        "keypoints": answer.evidence.num_keypoints,
+        "correspondences": answer.evidence.num_correspondences,
+        "inliers": answer.evidence.num_inliers,
+        "error": error,
+    }

@@ -12,10 +12,7 @@ root may do: it is killed where it needs more.
 from __future__ import annotations
 
 import atexit
-import json
 import os
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -28,6 +25,7 @@ import typer
 
 from benchmarks.reliability.service_process import ServiceProcess, peak_resident_bytes
 from benchmarks.speed.machine import load_average
+from benchmarks.speed.served import report_of
 from benchmarks.speed.steps import say
 from benchmarks.speed.tables import table
 
@@ -73,7 +71,7 @@ def main(
     measured = []
     for shape in shapes.split(","):
         with _service(maps_dir, shape, before, weights_dir) as service:
-            _ask(service, map_id, query, 1)  # the first answers of a process are slower
+            report_of(service.url, map_id, query)  # the first answers of a process are slower
             for concurrency in map(int, concurrencies.split(",")):
                 runs = [
                     _measure(service, shape, map_id, query, concurrency) for _ in range(repeats)
@@ -135,7 +133,7 @@ def _measure(
     service: ServiceProcess, shape: str, map_id: str, query: Path, concurrency: int
 ) -> Measured:
     began = service.processor_seconds()
-    report = _ask(service, map_id, query, concurrency)
+    report = report_of(service.url, map_id, query, concurrency)
     spent = service.processor_seconds() - began
     latencies = report["latency_s"]
     return Measured(
@@ -148,17 +146,6 @@ def _measure(
         max(map(peak_resident_bytes, service.worker_pids)),
         service.proportional_bytes(),
     )
-
-
-def _ask(service: ServiceProcess, map_id: str, query: Path, concurrency: int) -> dict[str, Any]:
-    with tempfile.TemporaryDirectory() as folder:
-        report = Path(folder) / "report.json"
-        command = [sys.executable, "-m", "clients", "benchmark", str(query), "--map", map_id]
-        command += ["--server", service.url, "--concurrency", str(concurrency)]
-        command += ["--report", str(report)]
-        subprocess.run(command, check=True, capture_output=True)
-        figures: dict[str, Any] = json.loads(report.read_text())
-        return figures
 
 
 if __name__ == "__main__":

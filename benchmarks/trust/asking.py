@@ -8,11 +8,11 @@ from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 
+from benchmarks.engines import engine_of
 from benchmarks.trust.maps import floor_of
 from benchmarks.trust.outcomes import Outcome, Query, outcome_of, refused_by_error
 from service.engine.engine import Engine
-from service.telemetry.metrics import Metrics
-from service.values import WorkerSettings, photo_job
+from service.values import photo_job
 from visloc.archive import MapStore
 from visloc.errors import InvalidInput
 from visloc.features import LocalFeatureExtractor, make_global_descriptor, make_local_features
@@ -20,7 +20,7 @@ from visloc.localization.localizer import Localizer
 from visloc.localization.query.feature_cache import FeatureCache
 from visloc.localization.solving import SeenImage
 from visloc.options import LocalizeOptions
-from visloc.photos.reading import ImageLimits, Photo
+from visloc.photos.reading import Photo
 from visloc.types import Answer, InstantAnswer
 
 OPTIONS = LocalizeOptions()
@@ -77,17 +77,7 @@ def ask_floors(
 
     An answer is right when it is on the photo's floor.
     """
-    limits = ImageLimits()
-    settings = WorkerSettings(
-        weights_dir=weights_dir,
-        threads=2,
-        max_loaded_bytes=2**33,
-        max_images=16,
-        max_instants=1000,
-        max_image_bytes=limits.max_bytes,
-        max_image_pixels=limits.max_pixels,
-    )
-    engine = Engine(store, settings, metrics=Metrics(), on_overdue=lambda: None)
+    engine = engine_of(store, weights_dir)
     for outcome in asyncio.run(_ask_engine(engine, queries)):
         if outcome.accepted and outcome.tile is not None:
             yield replace(outcome, right=floor_of(outcome.tile) == floor_of(outcome.photo))
