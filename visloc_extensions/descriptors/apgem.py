@@ -12,6 +12,7 @@ architecture is tested against its definition, the accuracy is not measured.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +36,7 @@ from visloc_extensions.descriptors.network_descriptor import (
     without_training,
 )
 from visloc_extensions.descriptors.principal_components import (
+    STAND_INS,
     PrincipalComponents,
     principal_components,
 )
@@ -70,7 +72,8 @@ def load_apgem(
     Raises:
         WeightsError: the file is missing, damaged, or of another network.
     """
-    checkpoint = without_training(read_weights(weights_dir, PUBLISHED))
+    with torch.serialization.safe_globals(STAND_INS):
+        checkpoint = without_training(read_weights(weights_dir, PUBLISHED))
     shapes = {
         **expected_shapes(DEPTH, TORCHVISION),
         "adpool.p": (1,),
@@ -78,7 +81,10 @@ def load_apgem(
         "fc.bias": (FEATURES,),
     }
     check_shapes(checkpoint, shapes, network=PUBLISHED.network, held="another network")
-    return ApGem(checkpoint, _whitening(checkpoint) if checkpoint.pca else None)
+    whitenings = checkpoint.beside.get("pca")
+    if not isinstance(whitenings, dict) or not whitenings:
+        return ApGem(checkpoint, None)
+    return ApGem(checkpoint, _whitening(checkpoint.path, whitenings))
 
 
 class ApGem(NetworkDescriptor):
@@ -119,18 +125,19 @@ def whitened(vectors: NDArray[np.float32], pca: PrincipalComponents) -> NDArray[
     return unit_rows(projected.astype(np.float32))
 
 
-def _whitening(checkpoint: Checkpoint) -> PrincipalComponents:
-    field = f"{checkpoint.path}, pca"
-    if PCA_NAME not in checkpoint.pca:
+def _whitening(path: Path, whitenings: Mapping[str, object]) -> PrincipalComponents:
+    field = f"{path}, pca"
+    pickled = whitenings.get(PCA_NAME)
+    if pickled is None:
         raise refuse(
             "weights.network",
             "the file holds whitening, but not that of the published AP-GeM",
             field=field,
             expected=PCA_NAME,
-            got=", ".join(sorted(checkpoint.pca)),
+            got=", ".join(sorted(map(str, whitenings))),
         )
     try:
-        pca = principal_components(checkpoint.pca[PCA_NAME])
+        pca = principal_components(pickled)
     except ValueError as error:
         raise refuse(
             "weights.format",

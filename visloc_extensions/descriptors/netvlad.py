@@ -25,8 +25,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from visloc.features.backends.convolution import Convolution
-from visloc.features.backends.torch import torch_convolution
+from visloc.features.backends.torch import for_inference
 from visloc.features.base import GlobalDescriptor
 from visloc.features.descriptors.whitening import unit_rows
 from visloc.features.weights.checkpoint import Checkpoint
@@ -95,7 +94,7 @@ class NetVlad(NetworkDescriptor):
             device,
             whitened="WPCA.0.weight" in tensors,
         )
-        self.encoder = make_vgg16(checkpoint).eval().to(device)
+        self.encoder = make_vgg16(checkpoint).to(device)
         self.assignment, self.centroids = (
             torch.tensor(array, dtype=torch.float32, device=device)
             for array in (tensors["pool.conv.weight"][:, :, 0, 0], tensors["pool.centroids"])
@@ -144,12 +143,13 @@ def make_vgg16(checkpoint: Checkpoint) -> nn.Sequential:
         for _ in widths:
             name = f"encoder.{len(steps)}"
             weight, bias = (
-                np.asarray(checkpoint.tensors[f"{name}.{part}"], np.float32)
+                torch.tensor(checkpoint.tensors[f"{name}.{part}"], dtype=torch.float32)
                 for part in ("weight", "bias")
             )
-            convolution = torch_convolution(Convolution(weight, bias, padding=(1, 1)))
+            convolution = nn.Conv2d(weight.shape[1], weight.shape[0], 3, padding=1)
+            convolution.weight, convolution.bias = nn.Parameter(weight), nn.Parameter(bias)
             steps += [convolution, nn.ReLU(inplace=True)]
-    return nn.Sequential(*steps[:-1])
+    return for_inference(nn.Sequential(*steps[:-1]))
 
 
 def _expected_shapes(whitened_dim: int | None) -> dict[str, tuple[int, ...]]:

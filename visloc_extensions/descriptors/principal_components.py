@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from math import prod
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.features.weights.pickled_pca import Array, Dtype, PickledPca
-
-_DTYPES: Mapping[str, np.dtype[Any]] = {"f4": np.dtype("<f4"), "f8": np.dtype("<f8")}
-_MAX_DIMENSIONS = 2
+# The modules of ``PCA`` before and after scikit-learn 0.22.
+_MODULES = ("sklearn.decomposition.pca", "sklearn.decomposition._pca")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,13 +29,23 @@ class PrincipalComponents:
     whiten: bool
 
 
-def principal_components(pickled: PickledPca) -> PrincipalComponents:
+class PickledPca:
+    """Stands in for a ``sklearn.decomposition.PCA``: keeps its attributes, and does nothing."""
+
+
+# For ``torch.serialization.safe_globals``.
+STAND_INS: list[Callable[..., object] | tuple[Callable[..., object], str]] = [
+    (PickledPca, f"{module}.PCA") for module in _MODULES
+]
+
+
+def principal_components(pickled: object) -> PrincipalComponents:
     """Return what a pickled PCA holds.
 
     Raises:
         ValueError: with the reason, when it is not whole or holds numbers that no PCA has.
     """
-    attributes = pickled.state if isinstance(pickled.state, dict) else {}
+    attributes = vars(pickled) if isinstance(pickled, PickledPca) else {}
     mean, components, variances = (
         _array(name, attributes.get(name))
         for name in ("mean_", "components_", "explained_variance_")
@@ -63,28 +69,10 @@ def principal_components(pickled: PickledPca) -> PrincipalComponents:
     return PrincipalComponents(mean, components, variances, bool(whiten))
 
 
-def _array(name: str, pickled: object) -> NDArray[np.float64]:
-    """Return an array that numpy pickled as (version, shape, dtype, is Fortran order, bytes)."""
-    state = pickled.state if isinstance(pickled, Array) else None
-    match state:
-        case (_, tuple(shape), dtype, bool(by_columns), bytes(data)) if len(
-            shape
-        ) <= _MAX_DIMENSIONS and all(type(side) is int and 0 <= side < 2**20 for side in shape):
-            numbers = np.frombuffer(data, _dtype(name, dtype))
-        case _:
-            raise ValueError(f"the PCA's {name} is no array, or has an odd description")
-    if numbers.size != prod(shape):
-        raise ValueError(f"the PCA's {name} holds {numbers.size} numbers, not {shape}")
-    array = numbers.reshape(shape, order="F" if by_columns else "C").astype(np.float64)
+def _array(name: str, held: object) -> NDArray[np.float64]:
+    if not (isinstance(held, np.ndarray) and held.dtype.kind == "f"):
+        raise ValueError(f"the PCA's {name} is no array of floats")
+    array: NDArray[np.float64] = held.astype(np.float64)
     if not np.isfinite(array).all():
         raise ValueError(f"the PCA's {name} holds numbers that are not finite")
     return array
-
-
-def _dtype(name: str, pickled: object) -> np.dtype[Any]:
-    """Return the type of numbers that numpy pickled with the state (version, byte order, ...)."""
-    if isinstance(pickled, Dtype):
-        match pickled.arguments, pickled.state:
-            case (("f4" | "f8") as code, *_), (_, "<", *_):
-                return _DTYPES[code]
-    raise ValueError(f"the PCA's {name} is not of little-endian floats")

@@ -15,14 +15,12 @@ import torch
 
 from visloc.errors import VislocError, refuse
 from visloc.features import make_local_features
-from visloc.features.backends.calibration import PICTURES, RECORDED
 from visloc_extensions.training.checkpoint import FILE_NAME, State, load_state
 from visloc_extensions.training.export import export
 from visloc_extensions.training.pairs import make_sources
 from visloc_extensions.training.parallax import pack_rooms, read_rooms
 from visloc_extensions.training.photos import pack_photos, read_pack
 from visloc_extensions.training.plots import draw
-from visloc_extensions.training.ranges import paint_pictures, record_ranges
 from visloc_extensions.training.run import Trainer, resume, train
 from visloc_extensions.training.settings import PRESETS, Settings
 from visloc_extensions.training.validation import (
@@ -107,12 +105,6 @@ def _parser() -> argparse.ArgumentParser:
     plots.add_argument("folder", type=Path, help="of the run")
     plots.add_argument("--beside", type=Path, help="what validate --output wrote of others")
     plots.set_defaults(run=_plots)
-
-    ranges = commands.add_parser("ranges", help="record activation ranges for 8-bit networks")
-    ranges.add_argument("--output", type=Path, default=RECORDED, help="folder of JSON files")
-    ranges.add_argument("--weights-dir", type=Path, help="with the published weights of R2D2")
-    ranges.add_argument("--pictures", action="store_true", help="paint the pictures again first")
-    ranges.set_defaults(run=_ranges)
     return parser
 
 
@@ -247,14 +239,6 @@ def _export(options: argparse.Namespace) -> int:
 
 def _plots(options: argparse.Namespace) -> int:
     for path in draw(options.folder, options.beside):
-        sys.stdout.write(f"{path}\n")
-    return 0
-
-
-def _ranges(options: argparse.Namespace) -> int:
-    if options.pictures:
-        paint_pictures(PICTURES)
-    for path in record_ranges(options.output, options.weights_dir):
         sys.stdout.write(f"{path}\n")
     return 0
 

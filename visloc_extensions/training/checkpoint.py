@@ -16,7 +16,7 @@ from visloc_extensions.training.files import write_whole
 from visloc_extensions.training.settings import Settings
 
 FILE_NAME = "checkpoint.pt"
-_VERSION = 2
+_VERSION = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,7 +30,7 @@ class State:
         step: how many are done.
         seconds: how long that took, on all machines together.
         sources: words for the model card: sha256 of the photos, their licences, and so on.
-        network: state dict of ``TrainableR2D2``, or of XFeat's ``XFeatModule``.
+        network: state dict of ``TrainableR2D2``, or of ``XFeat``.
         optimizer: state dict of Adam.
     """
 

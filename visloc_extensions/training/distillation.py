@@ -15,8 +15,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from visloc.features.networks.xfeat.model import read_published
-from visloc.features.networks.xfeat.torch import XFeatModule
+from visloc.features.networks.xfeat.load import published_path
+from visloc.features.networks.xfeat.model import read_network
 from visloc_extensions.training.augmentation import augment
 from visloc_extensions.training.conditions import Conditions
 from visloc_extensions.training.pairs import (
@@ -46,8 +46,8 @@ class Distillation:
 
     def __init__(self, settings: Settings, sources: Sources) -> None:
         self._settings, self._sources = settings, sources
-        teacher, _ = read_published(None)
-        self._teacher = XFeatModule(teacher).to(sources.device)
+        teacher, _ = read_network(published_path(None))
+        self._teacher = teacher.to(sources.device)
         # The batch norms stay inside the convolutions: a night's statistics are not a day's.
         self.network = deepcopy(self._teacher).requires_grad_(True)
         self._like = draw(sources, settings, 0)

@@ -7,17 +7,18 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import nn
 
 from visloc.errors import refuse
 from visloc.features.networks.r2d2 import model as r2d2
+from visloc.features.networks.r2d2.architecture import ARCHITECTURES
+from visloc.features.networks.r2d2.model import R2D2Network
 from visloc.features.networks.xfeat import model as xfeat
-from visloc.features.networks.xfeat.torch import XFeatModule
+from visloc.features.networks.xfeat.load import published_path
 from visloc_extensions.training.checkpoint import State
 from visloc_extensions.training.files import write_tensors
-from visloc_extensions.training.network import ARCHITECTURES, TrainableR2D2
 
 Arrays = Mapping[str, NDArray[Any]]
 
@@ -45,21 +46,19 @@ def export(state: State, output: Path) -> int:
 
 
 def _from_scratch(state: State) -> tuple[Arrays, dict[str, str]]:
-    trained = TrainableR2D2(ARCHITECTURES[state.settings.architecture])
-    trained.load_state_dict(state.network)
-    network = trained.folded()
-    _check_range({f"convolutions.{n}": c.weight for n, c in enumerate(network.convolutions)})
+    network = R2D2Network(ARCHITECTURES[state.settings.architecture])
+    network.load_state_dict(state.network)
+    network.double().fuse().float()
+    _check_range(network)
     words = {"format": "visloc folded R2D2, version 1", "licence": "BSD-3-Clause"}
     return r2d2.pack(network), words
 
 
 def _distilled(state: State) -> tuple[Arrays, dict[str, str]]:
-    teacher, teacher_sha256 = xfeat.read_published(None)
-    student = XFeatModule(teacher)
+    student, teacher_sha256 = xfeat.read_network(published_path(None))
     student.load_state_dict(state.network)
-    network = student.network()
-    _check_range({name: each for name, each in network.arrays().items() if "weight" in name})
-    return xfeat.pack(network), {
+    _check_range(student)
+    return xfeat.pack(student), {
         "format": "visloc fused XFeat, version 1",
         "licence": "Apache-2.0",
         "changed": "fine-tuned by visloc from the weights of XFeat (Potje et al. 2024)",
@@ -67,10 +66,10 @@ def _distilled(state: State) -> tuple[Arrays, dict[str, str]]:
     }
 
 
-def _check_range(weights: Arrays) -> None:
-    for name, weight in weights.items():
-        largest = float(np.abs(weight).max())
-        if not largest < _LARGEST_HALF:
+def _check_range(network: nn.Module) -> None:
+    for name, weight in network.state_dict().items():
+        largest = float(weight.abs().max())
+        if name.endswith("weight") and not largest < _LARGEST_HALF:
             raise refuse(
                 "training.range", field=name, expected=f"less than {_LARGEST_HALF}", got=largest
             )

@@ -8,8 +8,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from visloc.features.networks.r2d2.architecture import ARCHITECTURES
 from visloc_extensions.training.losses import peakiness_loss, reliability_loss, similarity_loss
-from visloc_extensions.training.network import ARCHITECTURES, Maps, TrainableR2D2
+from visloc_extensions.training.network import Maps, TrainableR2D2
 from visloc_extensions.training.pairs import Pairs, Sources, as_numbers, draw, from_numbers, make
 from visloc_extensions.training.sampler import sample
 from visloc_extensions.training.settings import Settings

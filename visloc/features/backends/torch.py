@@ -1,4 +1,4 @@
-"""Convolutions in torch for inference: fixed weights, fast memory layout."""
+"""Networks in torch for inference: fixed weights, fast memory layout."""
 
 from __future__ import annotations
 
@@ -7,31 +7,10 @@ from typing import TypeVar
 import torch
 from torch import nn
 
-from visloc.features.backends.convolution import Convolution
 from visloc.features.weights.checkpoint import Checkpoint
 from visloc.features.weights.files import check_shapes
 
 N = TypeVar("N", bound=nn.Module)
-
-
-def torch_convolution(convolution: Convolution) -> nn.Module:
-    """Return a convolution that will not be trained: an ``nn.Conv2d`` if it pads evenly."""
-    outputs, inputs_of_group, kernel, _ = convolution.weight.shape
-    before, after = convolution.padding
-    made = nn.Conv2d(
-        inputs_of_group * convolution.groups,
-        outputs,
-        kernel,
-        stride=convolution.stride,
-        dilation=convolution.dilation,
-        padding=before if before == after else 0,
-        groups=convolution.groups,
-    )
-    # channels_last is a quarter faster on CPUs when the input has the same layout.
-    weight = torch.tensor(convolution.weight).contiguous(memory_format=torch.channels_last)
-    made.weight = nn.Parameter(weight, requires_grad=False)
-    made.bias = nn.Parameter(torch.tensor(convolution.bias), requires_grad=False)
-    return made if before == after else nn.Sequential(nn.ZeroPad2d((before, after) * 2), made)
 
 
 def shapes_of(network: nn.Module) -> dict[str, tuple[int, ...]]:

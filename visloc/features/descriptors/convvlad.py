@@ -15,18 +15,17 @@ from numpy.typing import NDArray
 from visloc.features.base import Fingerprint, GlobalDescriptor
 from visloc.features.descriptors.vlad import VLAD_PARAMETERS, VladDescriptor
 from visloc.features.descriptors.whitening import unit_rows
-from visloc.features.networks.efficientnet.load import Network, make_network
-from visloc.features.networks.efficientnet.model import (
+from visloc.features.networks.efficientnet.load import (
     MAX_LONG_SIDE_PX,
-    blocks_of,
+    Network,
+    make_network,
     network_input,
-    read_efficientnet_lite0,
 )
 from visloc.options import Inference
 from visloc.types import LocalFeatures
 
-# The stem and all blocks before the last halving of the resolution: 112 channels.
-NUM_BLOCKS = 12
+# After the stem, all blocks before the last halving of the resolution: 112 channels.
+NUM_BLOCKS = 11
 
 
 def load_convvlad(
@@ -42,9 +41,7 @@ def load_convvlad(
         WeightsError: the weights are missing, damaged, or of another network.
         InvalidInput: ``inference.unavailable``.
     """
-    checkpoint = read_efficientnet_lite0(weights_dir)
-    network = make_network(blocks_of(checkpoint)[:NUM_BLOCKS], inference, threads)
-    return ConvVlad(network, checkpoint.sha256)
+    return ConvVlad(*make_network("convvlad", NUM_BLOCKS, weights_dir, inference, threads))
 
 
 class ConvVlad(VladDescriptor):

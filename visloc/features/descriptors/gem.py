@@ -16,12 +16,11 @@ from visloc.features.base import Fingerprint, GlobalDescriptor
 from visloc.features.descriptors.image_descriptor import ImageDescriptor
 from visloc.features.descriptors.pooling import generalized_mean
 from visloc.features.descriptors.whitening import WHITENING_PARAMETERS
-from visloc.features.networks.efficientnet.load import Network, make_network
-from visloc.features.networks.efficientnet.model import (
+from visloc.features.networks.efficientnet.load import (
     MAX_LONG_SIDE_PX,
-    blocks_of,
+    Network,
+    make_network,
     network_input,
-    read_efficientnet_lite0,
 )
 from visloc.options import Inference
 
@@ -41,9 +40,7 @@ def load_gem(
         WeightsError: the weights are missing, damaged, or of another network.
         InvalidInput: ``inference.unavailable``.
     """
-    checkpoint = read_efficientnet_lite0(weights_dir)
-    network = make_network(blocks_of(checkpoint), inference, threads)
-    return Gem(network, checkpoint.sha256)
+    return Gem(*make_network("gem", None, weights_dir, inference, threads))
 
 
 class Gem(ImageDescriptor):

@@ -1,14 +1,16 @@
 """Reads the tensors of a weights file without running anything that the file says.
 
-The library safetensors reads files of that name, ``torch_file`` those of PyTorch.
+The library safetensors reads files of that name. torch reads those that it saved, and makes nothing
+but tensors and plain values of them (``weights_only``).
 """
 
 from __future__ import annotations
 
 import hashlib
+import io
 import pickle
-import struct
-import zipfile
+import threading
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,27 +22,29 @@ from safetensors import SafetensorError
 from safetensors.numpy import load as load_safetensors
 
 from visloc.errors import refuse
-from visloc.features.weights.pickled_pca import PickledPca
-from visloc.features.weights.torch_file import read_torch_file
 
 MAX_FILE_BYTES = 256 * 2**20
 _SAFETENSORS_LENGTH_BYTES = 8  # of the number that says how long the header is
 # The library allows ten times as much, enough to name millions of empty tensors.
 _MAX_SAFETENSORS_HEADER_BYTES = 10_000_000
 _DTYPES = frozenset(map(np.dtype, ("<f4", "<f8", "<f2", "<i8")))
+# Where training programs keep the state dict, beside what they know about the training.
+_STATE_DICT_KEYS = ("state_dict", "model_state")
+
+# The names that torch takes are the whole process's: one thread would take them from another.
+_SAFE_NAMES_LOCK = threading.Lock()
 
 # Damaged files raise these, according to the documentation of ``pickle`` and to experiments.
 _MALFORMED = (
     SafetensorError,
     pickle.UnpicklingError,
-    struct.error,
-    zipfile.BadZipFile,
     ArithmeticError,
     AssertionError,
     AttributeError,
     EOFError,
     LookupError,
     MemoryError,
+    OSError,
     RuntimeError,
     TypeError,
     ValueError,
@@ -54,32 +58,39 @@ class Checkpoint:
     Attributes:
         path: where it was read from.
         sha256: of the file, lower-case hexadecimal.
-        tensors: arrays by their names in the state dict; read-only.
-        pca: the PCAs of scikit-learn that the file holds under ``pca`` beside the state dict.
+        tensors: arrays by their names in the state dict; not to be written to.
+        beside: what the file holds beside the state dict.
     """
 
     path: Path
     sha256: str
     tensors: Mapping[str, NDArray[Any]]
-    pca: Mapping[str, PickledPca] = field(default_factory=dict)
+    beside: Mapping[str, Any] = field(default_factory=dict)
 
     def renamed(self, name_of: Callable[[str], str]) -> Checkpoint:
         """Return it with other names of the tensors."""
         return replace(self, tensors={name_of(name): a for name, a in self.tensors.items()})
 
 
+def sha256_of(path: Path, max_bytes: int = MAX_FILE_BYTES) -> str:
+    """Return the sha256 of a weights file, whose content is not looked at.
+
+    Raises:
+        WeightsError: ``weights.unreadable`` or ``weights.too_large``.
+    """
+    return hashlib.sha256(_content(path, max_bytes)).hexdigest()
+
+
 def read_checkpoint(
     path: Path, max_bytes: int = MAX_FILE_BYTES, *, sha256: str | None = None
 ) -> Checkpoint:
-    """Read a safetensors file, or a state dict that PyTorch saved.
+    """Read a safetensors file, or a state dict that PyTorch saved, which loads torch.
 
-    The state dict may be bare or under the key ``state_dict`` or ``model_state`` of a dict. The
-    rest of that dict (the state of an optimizer, options, scores) is ignored, except for PCAs of
-    scikit-learn under ``pca``.
+    The state dict may be bare or under the key ``state_dict`` or ``model_state`` of a dict.
 
     Args:
         path: the file.
-        max_bytes: how large it may be, and the tensors of a state dict together.
+        max_bytes: how large it may be.
         sha256: of the only file that will do; checked before anything is read out of it.
 
     Raises:
@@ -88,13 +99,7 @@ def read_checkpoint(
             ``weights.format`` when it is neither safetensors nor a PyTorch file of plain tensors,
             is damaged, or names anything that a state dict does not need.
     """
-    try:
-        with path.open("rb") as file:
-            data = file.read(max_bytes + 1)
-    except OSError as error:
-        raise refuse("weights.unreadable", field=str(path), got=error.strerror) from error
-    if len(data) > max_bytes:
-        raise refuse("weights.too_large", field=str(path), expected=f"at most {max_bytes} bytes")
+    data = _content(path, max_bytes)
     found_sha256 = hashlib.sha256(data).hexdigest()
     if sha256 not in (None, found_sha256):
         raise refuse(
@@ -103,11 +108,24 @@ def read_checkpoint(
     try:
         if data[_SAFETENSORS_LENGTH_BYTES : _SAFETENSORS_LENGTH_BYTES + 1] == b"{":
             return Checkpoint(path, found_sha256, _read_safetensors(data))
-        return Checkpoint(path, found_sha256, *read_torch_file(data, max_bytes))
+        return Checkpoint(path, found_sha256, *_read_torch_file(data))
     except _MALFORMED as error:
+        # The first line says what is wrong, and torch's others how to switch the checks off.
+        reason = str(error).strip().partition("\n")[0]
         raise refuse(
-            "weights.format", field=str(path), got=f"{type(error).__name__}: {error}"
+            "weights.format", field=str(path), got=f"{type(error).__name__}: {reason}"
         ) from error
+
+
+def _content(path: Path, max_bytes: int) -> bytes:
+    try:
+        with path.open("rb") as file:
+            data = file.read(max_bytes + 1)
+    except OSError as error:
+        raise refuse("weights.unreadable", field=str(path), got=error.strerror) from error
+    if len(data) > max_bytes:
+        raise refuse("weights.too_large", field=str(path), expected=f"at most {max_bytes} bytes")
+    return data
 
 
 def _read_safetensors(data: bytes) -> dict[str, NDArray[Any]]:
@@ -123,3 +141,55 @@ def _read_safetensors(data: bytes) -> dict[str, NDArray[Any]]:
             raise ValueError(f"tensor {name:.60} is of type {array.dtype}")
         array.flags.writeable = False
     return tensors
+
+
+def _read_torch_file(data: bytes) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    """Return the tensors of the state dict, and what is beside it."""
+    import torch
+
+    with (
+        _SAFE_NAMES_LOCK,
+        torch.serialization.safe_globals(_beside_tensors()),
+        warnings.catch_warnings(),
+    ):
+        warnings.simplefilter("ignore", UserWarning)  # of pickles that torch then refuses
+        content = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    beside: dict[str, Any] = {}
+    if isinstance(content, dict):
+        key = next((key for key in _STATE_DICT_KEYS if key in content), None)
+        if key is not None:
+            beside = {name: value for name, value in content.items() if name != key}
+            content = content[key]
+    if not (isinstance(content, dict) and content):
+        raise ValueError("no state dict")
+    tensors: dict[str, NDArray[Any]] = {}
+    for name, value in content.items():
+        if not (isinstance(name, str) and isinstance(value, torch.Tensor)):
+            raise TypeError(f"the state dict holds {type(value).__name__} under {name!r:.60}")
+        tensors[name] = value.detach().numpy()
+        if tensors[name].dtype not in _DTYPES:
+            raise ValueError(f"tensor {name:.60} is of type {tensors[name].dtype}")
+    return tensors, beside
+
+
+def _beside_tensors() -> list[Any]:
+    """Return what else published files name: numbers of NumPy, and dicts with a default."""
+    reconstruct, scalar = np.empty(0).__reduce__()[0], np.float32(0).__reduce__()[0]
+    types = [type(np.dtype(kind)) for kind in ("f4", "f8", "i8")]
+    functions = [
+        (function, f"numpy.{core}.multiarray.{name}")
+        for core in ("core", "_core")
+        for function, name in ((reconstruct, "_reconstruct"), (scalar, "scalar"))
+    ]
+    return [
+        np.ndarray,
+        np.dtype,
+        *types,
+        *functions,
+        (list, "builtins.list"),
+        (_empty_dict, "collections.defaultdict"),
+    ]
+
+
+def _empty_dict(*_default_factory: object) -> dict[Any, Any]:
+    return {}

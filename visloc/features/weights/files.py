@@ -70,31 +70,26 @@ SHIPPED: Mapping[str, str] = {
 _SHIPPED_FOLDER = Path(__file__).parent / "trained"
 
 
-def read_own_weights(feature: str, weights_dir: Path | None) -> Checkpoint | None:
-    """Read ``FEATURE.safetensors`` from the weights folder, else the shipped file, if there is one.
-
-    Returns None for a weights folder that does not exist: its name was meant for other weights.
-
-    Raises:
-        WeightsError: those of ``read_checkpoint``.
-    """
-    file_name = f"{feature}.safetensors"
-    if weights_dir is not None and (weights_dir / file_name).is_file():
-        return read_checkpoint(weights_dir / file_name)
-    if feature not in SHIPPED or (weights_dir is not None and not weights_dir.is_dir()):
-        return None
-    return read_checkpoint(_SHIPPED_FOLDER / file_name, sha256=SHIPPED[feature])
+def shipped_path(feature: str) -> Path:
+    """Return where our own weights of a feature lie."""
+    return _SHIPPED_FOLDER / f"{feature}.safetensors"
 
 
-def read_weights(weights_dir: Path | None, published: PublishedWeights) -> Checkpoint:
-    """Read the named file from the weights folder.
+def own_path(feature: str, weights_dir: Path | None) -> Path | None:
+    """Return ``FEATURE.safetensors`` in the weights folder, if it is there."""
+    path = None if weights_dir is None else weights_dir / f"{feature}.safetensors"
+    return path if path is not None and path.is_file() else None
 
-    A file with another sha256 is read too, because people train their own. Its sha256 goes into
+
+def published_path(weights_dir: Path | None, published: PublishedWeights) -> Path:
+    """Return the named file in the weights folder.
+
+    A file with another sha256 will do too, because people train their own. Its sha256 goes into
     the features' fingerprint, and ``check_shapes`` tells whether it fits the network.
 
     Raises:
         WeightsError: ``weights.missing`` with what to download, from where, under which licence,
-            and where to put it; and those of ``read_checkpoint``.
+            and where to put it.
     """
     path = None if weights_dir is None else weights_dir / published.file_name
     if path is None or not path.is_file():
@@ -108,7 +103,16 @@ def read_weights(weights_dir: Path | None, published: PublishedWeights) -> Check
             expected=f"a folder with {published.file_name}",
             got="no weights folder" if weights_dir is None else f"no such file in {weights_dir}",
         )
-    return read_checkpoint(path, published.max_bytes)
+    return path
+
+
+def read_weights(weights_dir: Path | None, published: PublishedWeights) -> Checkpoint:
+    """Read the file that ``published_path`` finds.
+
+    Raises:
+        WeightsError: those of ``published_path`` and ``read_checkpoint``.
+    """
+    return read_checkpoint(published_path(weights_dir, published), published.max_bytes)
 
 
 def find_weights(

@@ -39,7 +39,7 @@ def _pretend_cpu(
 
 
 def _pretend_failing_import(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
-    def fail() -> tuple[ModuleType, ModuleType]:
+    def fail() -> ModuleType:
         raise error
 
     monkeypatch.setattr(inference, "import_openvino", fail)

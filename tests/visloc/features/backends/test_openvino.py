@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import importlib
 import os
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -10,23 +11,37 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from visloc.features.backends.convolution import Convolution
-from visloc.features.backends.openvino import Graph, GraphBuilder, import_openvino
+from visloc.features.backends.openvino import Graph, import_openvino
 
 _SIDES = (8, 256, 16)
 
 
+def _doubling(*, in_8_bits: bool) -> Graph:
+    """Doubles images of one channel, after rounding what enters to whole numbers if in 8 bits."""
+    openvino = import_openvino()
+    operations = importlib.import_module("openvino.opset13")
+    x = operations.parameter([1, 1, -1, -1], np.float32, name="x")
+    ends = [operations.constant(np.float32(end)) for end in (0, 255)]
+    rounded = operations.fake_quantize(x, *ends, *ends, 256)
+    kernel = operations.constant(np.full((1, 1, 1, 1), 2, np.float32))
+    doubled = operations.convolution(rounded, kernel, [1, 1], [0, 0], [0, 0], [1, 1])
+    model = openvino.Model([doubled.output(0)], [x], "doubling")
+    return Graph(model, in_8_bits=in_8_bits, threads=1, computed_with="test")
+
+
 @pytest.fixture
 def doubling() -> Graph:
-    """Doubles images of one channel."""
-    _, operations = import_openvino()
-    x = operations.parameter([1, 1, -1, -1], np.float32, name="x")
-    double = Convolution(np.full((1, 1, 1, 1), 2, np.float32), np.zeros(1, np.float32))
-    return Graph([x], [GraphBuilder().convolution(x, "only", double)], 1)
+    return _doubling(in_8_bits=False)
 
 
 def _image(side: int, value: float) -> NDArray[np.float32]:
     return np.full((1, 1, side, side), value, np.float32)
+
+
+@pytest.mark.parametrize(("in_8_bits", "doubled"), [(True, 6), (False, 6.5)])
+def test_rounding_of_a_graph_is_left_out_in_floats(in_8_bits: bool, doubled: float) -> None:
+    (result,) = _doubling(in_8_bits=in_8_bits)(_image(8, 3.25))
+    np.testing.assert_allclose(result, _image(8, doubled), rtol=1e-6)
 
 
 def test_what_was_computed_stays_when_larger_images_follow(doubling: Graph) -> None:

