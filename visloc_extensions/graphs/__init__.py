@@ -1,0 +1,1 @@
+"""Adds ``mapping export-graph``: with it, OpenVINO computes networks with weights of your own."""
