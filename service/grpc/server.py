@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import asyncio
-
 import grpc
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
 from service.engine.engine import Engine
 from service.grpc.access import AccessInterceptor
-from service.grpc.connections import GrpcConnections
+from service.grpc.arrivals import TimelyCalls
 from service.grpc.envelope import Envelope
 from service.grpc.localization import LocalizationServicer
 from service.grpc.maps import MapsServicer
-from service.grpc.slow_clients import TimelyCalls
 from service.security.access import Access
 from service.security.tls import Certificate
 from service.settings import ServiceSettings
@@ -25,6 +22,8 @@ from visloc_api.v1 import localization_pb2_grpc as pb2_grpc
 SERVICE_NAMES = tuple(
     pb2.DESCRIPTOR.services_by_name[name].full_name for name in ("Localization", "Maps")
 )
+# A connection without a call is closed after this time.
+_IDLE_MS = 60_000
 
 
 class GrpcServer:
@@ -43,22 +42,17 @@ class GrpcServer:
         certificate: Certificate | None,
     ) -> None:
         envelope = Envelope(observer)
-        self._connections = GrpcConnections(settings.max_connections)
         patience_s = settings.arrival_timeout_s
         self._server = grpc.aio.server(
             interceptors=[
                 AccessInterceptor(access, envelope, max(1, settings.max_connections // 2)),
-                TimelyCalls(
-                    envelope,
-                    self._connections,
-                    patience_s,
-                    settings.max_message_bytes,
-                    max_waiting=max(1, settings.max_connections // 4),
-                ),
+                TimelyCalls(envelope, patience_s, settings.max_message_bytes),
             ],
             options=[
                 ("grpc.max_receive_message_length", settings.max_message_bytes),
-                *self._connections.options,
+                ("grpc.max_allowed_incoming_connections", settings.max_connections),
+                # Clients connect again by themselves.
+                ("grpc.max_connection_idle_ms", _IDLE_MS),
                 # For connections that send nothing, or no HTTP/2 preface.
                 ("grpc.server_handshake_timeout_ms", round(1000 * patience_s)),
                 ("grpc.so_reuseport", 0),  # a second server on the port is a mistake
@@ -89,7 +83,6 @@ class GrpcServer:
         """Accept calls."""
         await self.set_serving(False)
         await self._server.start()
-        self._watching = asyncio.create_task(self._connections.watch(self.port))
 
     async def set_serving(self, serving: bool) -> None:
         """Let health say SERVING or NOT_SERVING."""
@@ -101,4 +94,3 @@ class GrpcServer:
         """Refuse new calls, and give running ones ``grace_s`` seconds to finish."""
         await self._health.enter_graceful_shutdown()
         await self._server.stop(grace_s)
-        self._watching.cancel()

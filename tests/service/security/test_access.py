@@ -24,9 +24,8 @@ from starlette.types import ASGIApp, Receive, Send
 from starlette.types import Scope as AsgiScope
 
 from service.grpc.access import AccessInterceptor
-from service.grpc.connections import GrpcConnections
+from service.grpc.arrivals import TimelyCalls
 from service.grpc.envelope import Envelope
-from service.grpc.slow_clients import TimelyCalls
 from service.http.access import add_access
 from service.security.access import (
     ANY_KEY,
@@ -564,7 +563,7 @@ def grpc_door(access: Access, grace_s: float = 20.0) -> Iterator[GrpcDoor]:
         server = grpc.aio.server(
             interceptors=(
                 AccessInterceptor(access, envelope, 10),
-                TimelyCalls(envelope, GrpcConnections(100), grace_s, 0, max_waiting=100),
+                TimelyCalls(envelope, grace_s, 0),
             )
         )
         pb2_grpc.add_LocalizationServicer_to_server(servicer, server)

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.grpc.wire_format import num_values
+from service.grpc.reading import num_values
 from visloc_api.v1 import localization_pb2 as pb2
 
 RIG = pb2.LocalizeRigRequest.DESCRIPTOR
