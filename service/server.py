@@ -8,20 +8,19 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import uvicorn
 from starlette.applications import Starlette
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from service.descriptors import METRICS_CONNECTIONS
 from service.engine.engine import Engine
 from service.engine.stores import open_store
 from service.grpc.server import GrpcServer
-from service.http.acceptor import Acceptor, OpenConnections, Patient
 from service.http.app import create_app
+from service.http.arrivals import Arrivals
 from service.http.envelope import Backend
 from service.http.health import metrics_app
-from service.http.slow_clients import Arrivals, http_protocol
 from service.security.access import open_access
 from service.security.tls import Certificate, open_certificate
 from service.settings import ServiceSettings, SettingsError
@@ -36,6 +35,10 @@ from visloc.options import Inference
 # When the server stops: the time in which requests that are already on their way, over open or new
 # connections, still get an answer, 503. After it, idle connections are closed.
 _LAST_WORDS_S = 0.3
+# Largest head of a request: several times what the longest keys and ids need.
+_MAX_HEAD_BYTES = 16 * 1024
+# Connections that wait to be accepted. asyncio tries as many times in a row when files run out.
+_BACKLOG = 512
 
 
 class Server:
@@ -62,17 +65,19 @@ class Server:
             self.observer,
             access,
             Arrivals(settings.arrival_timeout_s, settings.max_buffered_bytes),
-            OpenConnections(settings.max_connections),
             self.state,
         )
         with ExitStack() as opened:
-            listener = opened.enter_context(_listen(settings.host, settings.http_port))
-            self._http = [self._http_server(listener)]
+            listener = opened.enter_context(_listen(settings, settings.http_port))
+            app = create_app(self.backend)
+            self._http = _HttpServer(app, listener, settings.max_connections, self._certificate)
+            self._servers = [self._http]
             self.http_port: int = listener.getsockname()[1]
             self.metrics_port: int | None = None
             if settings.metrics_port is not None:
-                listener = opened.enter_context(_listen(settings.host, settings.metrics_port))
-                self._http.append(self._metrics_server(listener))
+                listener = opened.enter_context(_listen(settings, settings.metrics_port))
+                metrics = metrics_app(self.backend)
+                self._servers.append(_HttpServer(metrics, listener, METRICS_CONNECTIONS, None))
                 self.metrics_port = listener.getsockname()[1]
             try:
                 self._grpc = GrpcServer(
@@ -81,22 +86,13 @@ class Server:
             except RuntimeError as error:
                 address = f"{settings.host}:{settings.grpc_port}"
                 raise OSError(f"cannot listen on {address}: {error}") from None
-            opened.pop_all()  # the acceptors close the sockets from here on
+            opened.pop_all()  # the servers close the sockets from here on
         self.grpc_port = self._grpc.port
-
-    def _http_server(self, listener: socket.socket) -> _HttpServer:
-        app, connections = create_app(self.backend), self.backend.connections
-        grace_s = self._settings.arrival_timeout_s
-        return _HttpServer(app, listener, connections, grace_s, self._certificate)
-
-    def _metrics_server(self, listener: socket.socket) -> _HttpServer:
-        app, connections = metrics_app(self.backend), OpenConnections(METRICS_CONNECTIONS)
-        return _HttpServer(app, listener, connections, self._settings.arrival_timeout_s, None)
 
     async def open(self) -> None:
         """Answer requests. Until ``load`` is done, /readyz and gRPC's health say not ready."""
         await self._grpc.start()
-        self._serving = [asyncio.create_task(server.serve()) for server in self._http]
+        self._serving = [asyncio.create_task(server.serve()) for server in self._servers]
 
     async def load(self) -> None:
         """Open the maps, warm up, and accept photos."""
@@ -112,7 +108,7 @@ class Server:
         await self._grpc.set_serving(False)
         await asyncio.sleep(self._settings.drain_delay_s)
         self.engine.drain()
-        for server in self._http:
+        for server in self._servers:
             server.config.timeout_graceful_shutdown = max(1, int(grace_s))
             server.should_exit = True
         await asyncio.gather(self._grpc.stop(grace_s), *self._serving)
@@ -142,7 +138,7 @@ class Server:
             loaded_maps=loaded,
             max_loaded_bytes=settings.max_loaded_bytes,
             unusable_maps={map_id: error.code for map_id, error in status.not_loaded.items()},
-            connections=len(self.backend.connections),
+            connections=len(self._http.server_state.connections),
             max_connections=settings.max_connections,
             store_reachable=self._store.reachable,
             buffered_bytes=self.backend.arrivals.bytes_held,
@@ -178,13 +174,12 @@ def _make_engine(settings: ServiceSettings, store: MapStore, observer: Observer)
 
 
 class _HttpServer(uvicorn.Server):
-    """uvicorn with connections from an ``Acceptor``.
+    """uvicorn on a socket that already listens.
 
     Args:
         app: answers.
         listener: the listening socket.
-        connections: at most so many, and not too slow.
-        grace_s: the longest TLS handshake, head, or body of a refused request.
+        max_connections: limit of open connections; further ones are closed at once.
         certificate: for TLS; None for plain HTTP.
     """
 
@@ -192,65 +187,64 @@ class _HttpServer(uvicorn.Server):
         self,
         app: Starlette,
         listener: socket.socket,
-        connections: OpenConnections,
-        grace_s: float,
+        max_connections: int,
         certificate: Certificate | None,
     ) -> None:
+        class LimitedProtocol(H11Protocol):
+            def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+                super().connection_made(transport)
+                if len(self.connections) > max_connections:
+                    transport.abort()
+
         super().__init__(
             uvicorn.Config(
-                Patient(app, connections),
+                app,
                 log_config=None,
                 log_level="error",  # its warnings are of callers' mistakes, one line for each
                 access_log=False,
                 ws="none",
                 proxy_headers=False,  # any local process could forge them
-                http=http_protocol(grace_s, connections),
+                http=LimitedProtocol,
+                backlog=_BACKLOG,
+                h11_max_incomplete_event_size=_MAX_HEAD_BYTES,
+                ssl_context_factory=None
+                if certificate is None
+                else lambda *_: certificate.server_context(),
             )
         )
         self._listener = listener
-        self._open = connections
-        self._grace_s = grace_s
-        self._certificate = certificate
 
-    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+    async def serve(self, sockets: list[socket.socket] | None = None) -> None:
+        """Answer requests until ``should_exit``."""
         del sockets
-        await super().startup(sockets=[])  # uvicorn itself listens nowhere
-        certificate = self._certificate
-        context = None if certificate is None else lambda: certificate.context
-        self._acceptor = Acceptor(
-            self._listener, self._open, self._make_protocol, context, self._grace_s
-        )
+        await super().serve([self._listener])
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Accept no more connections, and return when all requests have ended."""
-        del sockets
         await asyncio.sleep(_LAST_WORDS_S)
-        self._acceptor.close()
-        await asyncio.sleep(_LAST_WORDS_S)  # for the last ones that it accepted
-        self._open.close_unopened()  # uvicorn does not know them yet
-        await super().shutdown()
+        await super().shutdown(sockets)
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
         """Leave signals to ``main``, because they end gRPC too."""
         yield
 
-    def _make_protocol(self) -> Any:
-        return self.config.http_protocol_class(  # type: ignore[call-arg]
-            config=self.config, server_state=self.server_state, app_state=self.lifespan.state
-        )
 
-
-def _listen(host: str, port: int) -> socket.socket:
+def _listen(settings: ServiceSettings, port: int) -> socket.socket:
+    host = settings.host
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
-        listener = socket.create_server((host, port), family=family, backlog=2048)
+        listener = socket.create_server((host, port), family=family, backlog=_BACKLOG)
     except OSError as error:
         raise OSError(f"cannot listen on {host}:{port}: {error}") from None
-    # Connections inherit it. asyncio sets it only on sockets made with TCP's protocol number, which
-    # create_server does not do. Without it, every later answer on a connection waits 40 ms for an
-    # acknowledgement.
+    # Connections inherit these options. asyncio sets TCP_NODELAY only on sockets made with TCP's
+    # protocol number, which create_server does not do. Without it, every later answer on a
+    # connection waits 40 ms for an acknowledgement.
     listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    # The system then closes connections of clients that are gone, or take nothing of an answer.
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    patience_ms = round(1000 * settings.arrival_timeout_s)
+    listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, patience_ms)
     return listener
 
 

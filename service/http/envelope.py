@@ -15,9 +15,8 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from service.api.deadlines import TimeLimit, request_id, time_limit_of
 from service.engine.engine import Engine
 from service.errors import internal_error, stopping_error
-from service.http.acceptor import OpenConnections
+from service.http.arrivals import Arrivals
 from service.http.responses import problem_response
-from service.http.slow_clients import Arrivals
 from service.security.access import FORWARDED_HEADER, Access
 from service.settings import ServiceSettings
 from service.telemetry.logs import UNMATCHED, RequestRecord
@@ -29,7 +28,7 @@ from visloc_api.words.wire import TIMEOUT_HEADER
 
 logger = logging.getLogger(__name__)
 
-# Routes that are answered even when all connections are in use.
+# Routes that are answered even when there are too many requests.
 PROBED_PATHS = ("/healthz", "/readyz", "/metrics")
 _METHODS = ("GET", "HEAD", "POST", "PUT", "DELETE", "OPTIONS", "PATCH")
 
@@ -41,8 +40,9 @@ class RequestEnvelope:
         self._app = app
         self._engine = backend.engine
         self._observer = backend.observer
-        self._connections = backend.connections
         self._access = backend.access
+        limit = backend.settings.max_connections
+        self._running, self._most_running = 0, limit - min(max(1, limit // 10), limit - 1)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -60,9 +60,11 @@ class RequestEnvelope:
                     self._complete(message, record)
                 await send(message)
 
+            self._running += 1
             try:
                 await self._serve(record, scope, receive, send_with_id)
             finally:
+                self._running -= 1
                 record.route = route_of(scope)
 
     def _complete(self, start: Message, record: RequestRecord) -> None:
@@ -89,7 +91,7 @@ class RequestEnvelope:
             if "content-length" in headers and "transfer-encoding" in headers:
                 # RFC 9112, 6.3: a proxy may have read the request differently.
                 await refuse(_ambiguous(), HTTPStatus.BAD_REQUEST)
-            elif self._connections.is_busy and scope["path"] not in PROBED_PATHS:
+            elif self._running > self._most_running and scope["path"] not in PROBED_PATHS:
                 await refuse(_busy())
             else:
                 await self._app(scope, receive, send)
@@ -130,7 +132,6 @@ class Backend:
 
     Attributes:
         arrivals: the request bodies that are arriving.
-        connections: the open HTTP connections.
         state: returns the current state of the service, for ``/metrics``.
     """
 
@@ -139,7 +140,6 @@ class Backend:
     observer: Observer
     access: Access
     arrivals: Arrivals
-    connections: OpenConnections
     state: Callable[[], ServiceState]
 
 

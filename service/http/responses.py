@@ -48,10 +48,15 @@ def problem_of(error: VislocError, id_: str, status: HTTPStatus | None = None) -
 def problem_response(error: VislocError, id_: str, status: HTTPStatus | None = None) -> Response:
     """Answer with an error."""
     problem = problem_of(error, id_, status)
+    headers = {}
+    if isinstance(error, Unavailable):
+        headers["Retry-After"] = str(RETRY_AFTER_S)
+    if error.code == "request.too_slow":  # the rest of its body is not waited for
+        headers["Connection"] = "close"
     return Response(
         problem.model_dump_json(),
         problem.status,
-        {"Retry-After": str(RETRY_AFTER_S)} if isinstance(error, Unavailable) else None,
+        headers,
         media_type="application/problem+json",
     )
 

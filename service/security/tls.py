@@ -64,6 +64,17 @@ class Certificate:
         """The context for a new HTTPS connection."""
         return self._now().context
 
+    def server_context(self) -> ssl.SSLContext:
+        """Return the context of an HTTPS server, which gives new connections that of then."""
+
+        def renew(connection: ssl.SSLObject, name: str | None, first: ssl.SSLContext) -> None:
+            del name, first
+            connection.context = self.context
+
+        context = self.context
+        context.sni_callback = renew
+        return context
+
     def credentials(self) -> grpc.ServerCredentials:
         """Return credentials for gRPC that ask for the certificate with every connection."""
         sent = self._pair

@@ -20,6 +20,7 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from random import Random
@@ -32,9 +33,7 @@ from PIL import Image
 from service.api import jobs
 from service.grpc.messages import rig_job_of
 from service.grpc.reading import reader_of
-from service.http.bodies import max_sequence_values
-from service.http.forms import FormLimits, parse_form
-from service.http.slow_clients import LargeChunks
+from service.http.bodies import max_sequence_values, parse_form
 from service.settings import ServiceSettings
 from tests.fuzz.images import Images
 from visloc.archive.packed import unpack_map
@@ -207,11 +206,22 @@ def _unpacked(data: bytes) -> None:
 
 
 def _head_and_body(data: bytes) -> None:
-    connection = LargeChunks(h11.SERVER, 16 * 1024)
+    connection = h11.Connection(h11.SERVER, 16 * 1024)
     for start in range(0, len(data), 2**18):
         connection.receive_data(data[start : start + 2**18])
         while connection.next_event() not in (h11.NEED_DATA, h11.PAUSED):
             pass
+
+
+def _parsed_form(max_text_bytes: int, data: bytes) -> None:
+    parse_form(
+        "multipart/form-data; boundary=b",
+        data,
+        max_parts=32_001,
+        max_text_bytes=max_text_bytes,
+        text_names=(),
+        expected="a form",
+    )
 
 
 def parsers() -> dict[str, Callable[[], Parser]]:
@@ -219,7 +229,6 @@ def parsers() -> dict[str, Callable[[], Parser]]:
     batch, crlf = SETTINGS.max_batch_bytes, b"\r\n"
     most = max_sequence_values(SETTINGS)
     form = b'--b\r\nContent-Disposition: form-data; name="image"; filename="a"\r\n\r\n'
-    form_limits = FormLimits(32_001, batch)
     chunked = b"POST / HTTP/1.1\r\nHost: a\r\nTransfer-Encoding: chunked\r\n\r\n"
     return {
         **{f"photo: {kind}": lambda kind=kind: _photos(kind) for kind in _KINDS},
@@ -250,7 +259,7 @@ def parsers() -> dict[str, Callable[[], Parser]]:
         "multipart": lambda: Parser(
             "in a thread",
             batch,
-            lambda data: parse_form("multipart/form-data; boundary=b", data, form_limits, "a form"),
+            partial(_parsed_form, batch),
             (Input(form, b"\r\n-", b"\r\n--b--\r\n"), Input(b"", form + crlf, b"--b--\r\n")),
             (crlf, b"--b", b"-", b"\r", form, b'name="', b";", b"\0", b": "),
         ),

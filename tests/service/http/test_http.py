@@ -26,7 +26,6 @@ from pydantic import BaseModel
 from starlette.responses import PlainTextResponse
 
 import visloc
-from service.http.acceptor import OpenConnections
 from service.http.app import create_app
 from service.http.envelope import RequestEnvelope
 from service.http.openapi import example
@@ -441,7 +440,7 @@ def test_a_full_queue_is_429_with_retry_after(
 def test_a_server_that_stops_closes_each_connection_with_its_answer(doors: Any) -> None:
     async def ask(is_stopping: bool) -> httpx.Response:
         engine: Any = SimpleNamespace(draining=is_stopping)
-        backend = replace(doors.server.backend, engine=engine, connections=OpenConnections(1))
+        backend = replace(doors.server.backend, engine=engine)
         app = RequestEnvelope(PlainTextResponse("ok"), backend)
         transport = httpx.ASGITransport(app)
         async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as http:

@@ -16,11 +16,10 @@ from fastapi import FastAPI
 from starlette.datastructures import Headers
 
 import service.http.static_page
-from service.http.acceptor import OpenConnections
 from service.http.app import create_app
+from service.http.arrivals import Arrivals
 from service.http.cache_headers import is_current, takes_gzip
 from service.http.envelope import Backend
-from service.http.slow_clients import Arrivals
 from service.security.access import needed_over_http, open_access
 from service.security.key_file import Scope, edited_keys, new_key
 from service.settings import ServiceSettings
@@ -66,7 +65,6 @@ def app_with(**settings: Any) -> FastAPI:
             Observer(Metrics()),
             open_access(read),
             Arrivals(1.0, 1),
-            OpenConnections(1000),
             lambda: ServiceState(ready=True),
         )
     )
