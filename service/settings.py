@@ -107,17 +107,16 @@ class ServiceSettings(BaseModel):
     max_queue: Annotated[int, Field(ge=0)] = 64
     """photos that may wait for a worker; further requests are refused"""
     max_connections: Count = 1000
-    """limit of open HTTP connections, of open gRPC connections, and of running gRPC calls. At the
-    limit (gRPC: at three quarters of it), the longest idle connection is closed for a new one. The
-    limit is lowered if the system allows too few open files"""
+    """limit of open HTTP connections, of open gRPC connections, and of running gRPC calls; further
+    ones are closed or refused. The limit is lowered if the system allows too few open files"""
     max_buffered_bytes: Count = 512 * 2**20
     """memory for requests that are arriving, bytes; further requests are refused"""
     request_timeout_s: Seconds = 60.0
     """longest time from the arrival of a request to its answer, or to the next answer of a
     sequence; callers may ask for less"""
     arrival_timeout_s: Seconds = 20.0
-    """longest time for the head of a request to arrive, and again for its body, plus a second for
-    every 100 kB of it; also the longest silence within a stream"""
+    """longest time for the body of a request to arrive, plus a second for every 100 kB of it; also
+    the longest silence within a stream, and until a client takes something of its answer"""
     drain_delay_s: Annotated[float, Field(ge=0, le=3600)] = 0.0
     """time after SIGTERM during which /readyz already says no but new requests are still served,
     so that load balancers notice"""

@@ -72,11 +72,11 @@ def test_compose_has_the_service_and_what_watches_it(compose: dict[str, Any]) ->
         "mapping": ["tools"],
         "localize": ["tools"],
         "replica": ["replicas"],
-        "balancer": ["replicas"],
     }
     assert compose["services"].keys() - profiles.keys() == {
         "keys",
         "service",
+        "balancer",
         "prometheus",
         "grafana",
     }
@@ -118,10 +118,22 @@ def test_the_service_takes_the_settings_that_compose_gives(compose: dict[str, An
     mounted = set(volumes.values())
     for path in (settings.maps_dir, settings.cache_dir, settings.keys_file.parent):
         assert str(path) in mounted
-    published = {int(port.rsplit(":", 1)[1]) for port in service["ports"]}
-    assert published == {settings.http_port, settings.grpc_port}
     grace_s = int(service["stop_grace_period"].removesuffix("s"))
     assert grace_s > settings.drain_delay_s + settings.drain_timeout_s
+
+
+def test_only_the_balancer_is_published_and_reaches_the_service(compose: dict[str, Any]) -> None:
+    service, balancer = compose["services"]["service"], compose["services"]["balancer"]
+    environment = balancer["environment"]
+    settings = read_settings([], dockerfile()["serving"].environment)
+
+    assert not service.get("ports")
+    published = {port.rsplit(":", 1)[1] for port in balancer["ports"]}
+    assert published == {environment[f"{door}_BIND"].strip(":") for door in ("HTTP", "GRPC")}
+    assert environment["REPLICAS"] in service["networks"]["default"]["aliases"]
+    assert environment["REPLICA_HTTP_PORT"] == str(settings.http_port)
+    assert environment["REPLICA_GRPC_PORT"] == str(settings.grpc_port)
+    assert compose["services"]["localize"]["network_mode"] == "service:balancer"
 
 
 def test_the_second_replica_is_as_the_first_with_a_cache_of_its_own(

@@ -151,10 +151,9 @@ async def behind_balancer(maps: SampleMaps, work: Path, strength: Strength) -> l
         balanced([maps.folder], work, metrics_port=metrics_port) as found,
     ):
         part()
-        [service], http_port = found.replicas, int(found.http.rpartition(":")[2])
-        front = Addresses(found.http, http_port, found.grpc.removeprefix("grpc://"))
+        [service] = found.replicas
         return await _attacked_in_turn(
-            "balancer", maps, service, front, ANOTHER_ADDRESS, metrics_port, strength
+            "balancer", maps, service, found.front, ANOTHER_ADDRESS, metrics_port, strength
         )
 
 
@@ -188,7 +187,7 @@ async def _attack(besieged: Besieged, attack: Attack, strength: Strength) -> tup
     alone = await ask_in_turn(doors, cases, 1, seconds, seed)
     lines = _lines(service.log)
     front = besieged.front
-    port = front.http_port if attack.api == "HTTP" else int(front.grpc.rpartition(":")[2])
+    port = front.http_port if attack.api == "HTTP" else front.grpc_port
     number = FLOODING if attack.is_flood else strength.count // attack.one_in
     has_tls = front.trust is not None
     assault = Assault(attack.name, port, number, has_tls, strength.pause_s, besieged.source)

@@ -19,7 +19,12 @@ from typing import Any
 
 import httpx
 
-from benchmarks.reliability.service_process import READY_WITHIN_S, ServiceProcess, free_port
+from benchmarks.reliability.service_process import (
+    READY_WITHIN_S,
+    Addresses,
+    ServiceProcess,
+    free_port,
+)
 
 CONFIG = Path(__file__).resolve().parents[2] / "deploy" / "haproxy" / "haproxy.cfg"
 NAME = "replicas.test"
@@ -40,6 +45,12 @@ class Balanced:
     http: str
     grpc: str
     status: str
+
+    @property
+    def front(self) -> Addresses:
+        """Where callers find the balancer."""
+        port = int(self.http.rpartition(":")[2])
+        return Addresses(self.http, port, self.grpc.removeprefix("grpc://"))
 
     def serving(self) -> int:
         """How many replicas the balancer sends requests to, over each door."""

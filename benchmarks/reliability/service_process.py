@@ -37,6 +37,11 @@ class Addresses:
     grpc: str
     trust: bytes | None = None
 
+    @property
+    def grpc_port(self) -> int:
+        """The port of ``grpc``."""
+        return int(self.grpc.rpartition(":")[2])
+
     def tls(self) -> ssl.SSLContext | bool:
         """What a client needs to trust it: its certificate, if it has one."""
         if self.trust is None:
