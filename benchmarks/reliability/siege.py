@@ -9,7 +9,7 @@ import signal
 import threading
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import AsyncExitStack, ExitStack, suppress
+from contextlib import AsyncExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import monotonic
@@ -18,8 +18,9 @@ from typing import Any
 import httpx
 
 from benchmarks.reliability.asking import Case, Doors, good_cases
-from benchmarks.reliability.attackers import ATTACKS, Assault, Attack, attacked
+from benchmarks.reliability.attackers import ATTACKS, Assault, attacked
 from benchmarks.reliability.checks import Check, counts_text
+from benchmarks.reliability.connections import ANOTHER_ADDRESS
 from benchmarks.reliability.heavy_requests import heavy_photo_requests, many_value_messages
 from benchmarks.reliability.load import (
     RETRY_PAUSE_S,
@@ -29,14 +30,15 @@ from benchmarks.reliability.load import (
     stopped_within,
 )
 from benchmarks.reliability.maps import SampleMaps, leftovers, verify_store
-from benchmarks.reliability.service_process import ServiceProcess
+from benchmarks.reliability.replicas import Balanced, balanced
+from benchmarks.reliability.service_process import Addresses, ServiceProcess
 from benchmarks.reliability.soak import Expected, differing, unloaded_answers
 
 SHARE = 0.7  # of the capacity
 EVERY_S = 20.0  # swaps, kills, publications
 MAX_GROWTH = 0.10
 _CAPACITY_S = 10.0
-_HOLDING, _FLOODING = 40, 1  # connections of each attack, to each replica
+_HOLDING, _FLOODING = 80, 2  # connections of each attack
 _HEAVY_PAUSE_S = 2.0
 _WARM_SHARE = 1 / 3
 # The line of a request is written after its answer.
@@ -63,53 +65,42 @@ class Happened:
 
 
 async def siege(maps: SampleMaps, work: Path, seconds: float) -> list[Check]:
-    """Ask two replicas at 70 % of their capacity while all attacks run.
+    """Ask two replicas behind the balancer at 70 % of their capacity while all attacks run.
 
-    An honest client takes the replicas in turn, and asks the other one again when the first is
-    away or has no room.
+    The attacks come from one address, honest clients from another.
     """
     cases = good_cases(maps)
     happened = Happened()
-    with ExitStack() as services:
-        replicas = [
-            services.enter_context(ServiceProcess(maps.folder, work / f"replica-{n}.log"))
-            for n in range(2)
-        ]
-        async with AsyncExitStack() as opened:
-            doors = [await opened.enter_async_context(Doors(each.addresses)) for each in replicas]
-            expected = await unloaded_answers(doors[0], maps, cases)
-            alone = await asyncio.gather(
-                *(ask_in_turn(each, cases, 1, _CAPACITY_S) for each in doors)
-            )
-            capacity = sum(map(len, alone)) / _CAPACITY_S
+    with balanced([maps.folder, maps.folder], work) as found:
+        async with Doors(found.front) as doors:
+            expected = await unloaded_answers(doors, maps, cases)
+            alone = await ask_in_turn(doors, cases, 2, _CAPACITY_S)
+            capacity = len(alone) / _CAPACITY_S
             stop = asyncio.Event()
-            harm = asyncio.create_task(_harm(maps, replicas, doors, happened, stop, seconds))
+            harm = asyncio.create_task(_harm(maps, found, doors, happened, stop, seconds))
             honest = await _ask(doors, cases, SHARE * capacity, seconds)
             stop.set()
             await harm
-    quiet = [one.outcome.seconds for asked in alone for one in asked]
+    quiet = [one.outcome.seconds for one in alone]
     versions = await asyncio.to_thread(verify_store, maps.folder)
     return _checks(honest, expected, capacity, quiet, happened, versions, leftovers(maps.folder))
 
 
-async def _ask(
-    doors: Sequence[Doors], cases: Sequence[Case], rate: float, seconds: float
-) -> list[Persisted]:
+async def _ask(doors: Doors, cases: Sequence[Case], rate: float, seconds: float) -> list[Persisted]:
     draw, started = random.Random(0), monotonic()
     asking: list[asyncio.Task[Persisted]] = []
     while (now := monotonic() - started) < seconds:
         due = len(asking) / rate
         if now < due:
             await asyncio.sleep(due - now)
-        order = [doors[(len(asking) + n) % len(doors)] for n in range(len(doors))]
-        asking.append(asyncio.create_task(_persist(order, draw.choice(cases))))
+        asking.append(asyncio.create_task(_persist(doors, draw.choice(cases))))
     return list(await asyncio.gather(*asking))
 
 
-async def _persist(doors: Sequence[Doors], case: Case) -> Persisted:
+async def _persist(doors: Doors, case: Case) -> Persisted:
     started, tries = monotonic(), list[str]()
     while True:
-        outcome = await case.ask(doors[len(tries) % len(doors)])
+        outcome = await case.ask(doors)
         seconds = monotonic() - started
         # As long as the clients of the service do by default, and a little longer.
         if not outcome.status.startswith(_AGAIN) or seconds > 60:
@@ -120,17 +111,17 @@ async def _persist(doors: Sequence[Doors], case: Case) -> Persisted:
 
 async def _harm(
     maps: SampleMaps,
-    replicas: Sequence[ServiceProcess],
-    doors: Sequence[Doors],
+    found: Balanced,
+    doors: Doors,
     happened: Happened,
     stop: asyncio.Event,
     seconds: float,
 ) -> None:
     """Do everything at once until told to stop."""
-    heavy = threading.Event()
+    replicas, front, heavy = found.replicas, found.front, threading.Event()
     threads = [
-        asyncio.create_task(asyncio.to_thread(_send_heavy, maps, each, heavy, happened, number))
-        for number, each in enumerate(replicas)
+        asyncio.create_task(asyncio.to_thread(_send_heavy, maps, front, heavy, happened, number))
+        for number in range(len(replicas))
     ]
     async with AsyncExitStack() as attacks:
         await attacks.enter_async_context(
@@ -138,10 +129,10 @@ async def _harm(
                 [
                     Assault(
                         attack.name,
-                        _port(replica, attack),
+                        front.http_port if attack.api == "HTTP" else front.grpc_port,
                         _FLOODING if attack.is_flood else _HOLDING,
+                        source=ANOTHER_ADDRESS,
                     )
-                    for replica in replicas
                     for attack in ATTACKS
                     if not attack.hides_tls
                 ]
@@ -157,13 +148,9 @@ async def _harm(
     await asyncio.gather(*threads)
 
 
-def _port(replica: ServiceProcess, attack: Attack) -> int:
-    return replica.http_port if attack.api == "HTTP" else replica.grpc_port
-
-
 def _send_heavy(
     maps: SampleMaps,
-    replica: ServiceProcess,
+    front: Addresses,
     stop: threading.Event,
     happened: Happened,
     number: int,
@@ -172,14 +159,14 @@ def _send_heavy(
     messages = [*heavy_photo_requests(maps), *many_value_messages().values()]
     while not stop.wait(_HEAVY_PAUSE_S):
         with suppress(OSError, httpx.HTTPError):
-            happened.attacks[messages[number % len(messages)](replica.addresses)] += 1
+            happened.attacks[messages[number % len(messages)](front)] += 1
         number += 1
 
 
 async def _change(
     maps: SampleMaps,
     replicas: Sequence[ServiceProcess],
-    doors: Sequence[Doors],
+    doors: Doors,
     happened: Happened,
     stop: asyncio.Event,
 ) -> None:
@@ -189,9 +176,9 @@ async def _change(
     headers = {"Content-Type": "application/zip"}
 
     async def change(method: str, path: str, **body: Any) -> str:
-        replica, response = await _until_done(doors, method, path, **body)
+        response = await _until_done(doors, method, path, **body)
         if response.status_code >= 500:
-            happened.faults.append(f"{method} {path}: {await _told(response, replicas[replica])}")
+            happened.faults.append(f"{method} {path}: {await _told(response, *replicas)}")
         return str(response.status_code)
 
     async def use(map_id: str, version: str) -> None:
@@ -209,26 +196,22 @@ async def _change(
         await use("room", last)
 
 
-async def _told(response: httpx.Response, replica: ServiceProcess) -> str:
-    """Return an answer's body, and what the log of its replica says about it."""
+async def _told(response: httpx.Response, *replicas: ServiceProcess) -> str:
+    """Return an answer's body, and what the logs of the replicas say about it."""
     await asyncio.sleep(_LOGGED_AFTER_S)
     id_ = response.headers.get("x-request-id", "without an id")
-    lines = [line for line in replica.log.read_text(errors="replace").splitlines() if id_ in line]
+    logs = [replica.log.read_text(errors="replace") for replica in replicas]
+    lines = [line for log in logs for line in log.splitlines() if id_ in line]
     return f"{response.status_code} {response.text.strip()}; log: {' '.join(lines) or 'nothing'}"
 
 
-async def _until_done(
-    doors: Sequence[Doors], method: str, path: str, **body: Any
-) -> tuple[int, httpx.Response]:
-    """Ask the replicas in turn until one has room; return its number and its answer."""
-    tries = 0
+async def _until_done(doors: Doors, method: str, path: str, **body: Any) -> httpx.Response:
+    """Ask until there is room; return the answer."""
     while True:
         with suppress(httpx.TransportError):
-            replica = tries % len(doors)
-            response = await doors[replica].http.request(method, path, **body)
+            response = await doors.http.request(method, path, **body)
             if response.status_code not in (429, 503):
-                return replica, response
-        tries += 1
+                return response
         await asyncio.sleep(RETRY_PAUSE_S)
 
 
