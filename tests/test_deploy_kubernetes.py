@@ -333,7 +333,7 @@ def test_haproxy_takes_its_configuration(
 
 
 @NEEDS_HAPROXY
-def test_one_address_does_not_take_the_connections_of_others(tmp_path: Path) -> None:
+def test_one_address_does_not_take_the_places_of_others(tmp_path: Path) -> None:
     most = 5
     http, grpc, status = (free_port() for _ in range(3))
     environment = balancer_environment() | {
@@ -342,6 +342,7 @@ def test_one_address_does_not_take_the_connections_of_others(tmp_path: Path) -> 
         "STATUS_BIND": f"127.0.0.1:{status}",
         "NAMESERVER": "127.0.0.1:9",  # nobody, so that there are no replicas
         "MAX_PER_ADDRESS": str(most),
+        "MAX_REQUESTS_PER_ADDRESS": "3",
     }
 
     def answers(path: str, port: int, source: str) -> bool:
@@ -369,3 +370,7 @@ def test_one_address_does_not_take_the_connections_of_others(tmp_path: Path) -> 
 
         assert not answers("/", http, "127.0.0.2")
         assert answers("/", http, "127.0.0.3")
+        url = f"http://127.0.0.1:{http}/maps"
+        told = [httpx.get(url) for _ in range(4)]
+    assert [answer.status_code for answer in told] == [503, 503, 503, 429]
+    assert [answer.json()["code"] for answer in told[2:]] == ["server.unavailable", "server.busy"]

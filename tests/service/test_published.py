@@ -13,7 +13,7 @@ import httpx
 import pytest
 
 from benchmarks.reliability.attackers import Assault, attacked
-from benchmarks.reliability.replicas import Balanced, balanced, wait_until
+from benchmarks.reliability.replicas import Balanced, balanced
 from tests.service.test_replicas import accepted
 
 pytestmark = pytest.mark.skipif(
@@ -26,12 +26,23 @@ SLOW = ("send a head, a byte a second", "send a body, a byte a second", "send no
 
 
 @pytest.fixture(scope="module")
-def published(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Balanced]:
+def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Balanced]:
     """One replica without maps, and HAProxy before it."""
     work = tmp_path_factory.mktemp("published")
     (work / "maps").mkdir()
     with balanced([work / "maps"], work) as found:
         yield found
+
+
+@pytest.fixture
+def published(running: Balanced) -> Balanced:
+    """The same, whatever the test before did to the replica."""
+    (replica,) = running.replicas
+    if not replica.is_ready():
+        replica.start()
+        replica.wait_until_ready()
+        running.wait_until_serving(1)
+    return running
 
 
 def problem(answer: httpx.Response, status: int) -> str:
@@ -113,5 +124,3 @@ def test_while_no_replica_is_ready_the_service_says_why(published: Balanced) -> 
     assert httpx.get(f"{published.http}/healthz").is_success
     replica.stop()
     assert problem(httpx.get(f"{published.http}/maps", timeout=30), 503) == "server.unavailable"
-    replica.start()
-    wait_until(lambda: httpx.get(f"{published.http}/readyz", timeout=30).is_success)
