@@ -19,7 +19,7 @@ import typer
 
 from benchmarks.reliability.attackers import PAUSE_S
 from benchmarks.reliability.checks import print_checks
-from benchmarks.reliability.connections import Strength, behind_balancer, connections
+from benchmarks.reliability.connections import Strength, connections
 from benchmarks.reliability.heavy_requests import heavy_photos, many_values
 from benchmarks.reliability.kills import kill_service, kill_workers
 from benchmarks.reliability.maps import SampleMaps, make_maps
@@ -81,25 +81,11 @@ def connections_command(
         float, typer.Option(help="Seconds before a connection that was closed is opened again.")
     ] = PAUSE_S,
     kinds: Annotated[str, typer.Option(help="A word in the names of the attacks.")] = "",
-    balancer: Annotated[
-        bool, typer.Option(help="Attack one replica through HAProxy, from one address.")
-    ] = False,
-    files: Annotated[
-        list[int] | None, typer.Option(help="Most open files; 1024 and 65536 if not given.")
-    ] = None,
-    tls: Annotated[
-        bool | None, typer.Option(help="Only with TLS, or only without; both if not given.")
-    ] = None,
 ) -> None:
-    """Idle, slow and flooding connections, with few and many open files, without and with TLS."""
+    """Idle, slow and flooding connections, from one address, through HAProxy."""
     strength = Strength(count, seconds, pause, kinds)
     with _prepared() as (maps, work):
-        if balancer:
-            withstood = behind_balancer(maps, work, strength)
-        else:
-            both = (False, True) if tls is None else (tls,)
-            withstood = connections(maps, work, strength, files or (1024, 65536), tls=both)
-        print_checks("connections", asyncio.run(withstood))
+        print_checks("connections", asyncio.run(connections(maps, work, strength)))
 
 
 @app.command("heavy-photos")

@@ -70,9 +70,7 @@ class Doors:
     def __init__(self, service: Addresses) -> None:
         # No limits: the requests that wait are the test.
         limits = httpx.Limits(max_connections=None, max_keepalive_connections=64)
-        self.http = httpx.AsyncClient(
-            base_url=service.url, timeout=_ANSWER_WITHIN_S, limits=limits, verify=service.tls()
-        )
+        self.http = httpx.AsyncClient(base_url=service.url, timeout=_ANSWER_WITHIN_S, limits=limits)
         self._channel = channel_to(
             service,
             ("grpc.initial_reconnect_backoff_ms", 200),
@@ -94,11 +92,8 @@ class Doors:
 
 
 def channel_to(service: Addresses, *options: tuple[str, int]) -> grpc.aio.Channel:
-    """Open a channel, with TLS where the service has it."""
-    if service.trust is None:
-        return grpc.aio.insecure_channel(service.grpc, options=options)
-    credentials = grpc.ssl_channel_credentials(service.trust)
-    return grpc.aio.secure_channel(service.grpc, credentials, options=options)
+    """Open a channel."""
+    return grpc.aio.insecure_channel(service.grpc, options=options)
 
 
 @dataclass(frozen=True)

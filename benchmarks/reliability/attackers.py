@@ -1,4 +1,4 @@
-"""Clients that hold, fill or flood connections: kinds of attacks, over HTTP and gRPC, with TLS too.
+"""Clients that hold, fill or flood connections: kinds of attacks, over HTTP and gRPC.
 
 HTTP/2 is written by hand, because no library sends what is sent here (RFC 9113; header fields as
 literals without an index, RFC 7541 section 6.2.2).
@@ -10,7 +10,6 @@ import asyncio
 import multiprocessing
 import os
 import socket
-import ssl
 import struct
 from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
@@ -43,7 +42,6 @@ class Attack:
         api: ``HTTP`` or ``gRPC``, to which they go.
         play: one connection, until it has had enough or is closed.
         is_flood: whether few connections send much, rather than many next to nothing.
-        hides_tls: whether it speaks no TLS where it should.
         one_in: where each connection costs a request, there are so many times fewer of them.
     """
 
@@ -51,7 +49,6 @@ class Attack:
     api: str
     play: Play
     is_flood: bool = False
-    hides_tls: bool = False
     one_in: int = 1
 
 
@@ -63,7 +60,6 @@ class Assault:
         name: of one of ``ATTACKS``.
         port: that is attacked.
         connections: at once.
-        tls: whether the port speaks it.
         pause_s: before a connection that was closed is opened again.
         source: the address from which the connections come.
     """
@@ -71,7 +67,6 @@ class Assault:
     name: str
     port: int
     connections: int
-    tls: bool = False
     pause_s: float = PAUSE_S
     source: str = "127.0.0.1"
 
@@ -114,9 +109,8 @@ def _attack_until_told(assaults: Sequence[Assault], pipe: Connection) -> None:
 async def _attack(assaults: Sequence[Assault], pipe: Connection) -> None:
     seen: Counter[str] = Counter()
     running = [
-        asyncio.create_task(_attacker(assault, context, seen))
+        asyncio.create_task(_attacker(assault, seen))
         for assault in assaults
-        for context in [_strangers_tls(assault)]
         for _ in range(assault.connections)
     ]
     pipe.send(None)
@@ -128,22 +122,10 @@ async def _attack(assaults: Sequence[Assault], pipe: Connection) -> None:
     pipe.send(seen)
 
 
-def _strangers_tls(assault: Assault) -> ssl.SSLContext | None:
-    """The TLS of an attack's connections; strangers do not look at certificates."""
-    if not assault.tls or assault.attack.hides_tls:
-        return None
-    context = ssl.create_default_context()
-    context.check_hostname = False
-    context.verify_mode = ssl.CERT_NONE
-    if assault.attack.api == "gRPC":
-        context.set_alpn_protocols(["h2"])
-    return context
-
-
-async def _attacker(assault: Assault, tls: ssl.SSLContext | None, seen: Counter[str]) -> None:
+async def _attacker(assault: Assault, seen: Counter[str]) -> None:
     while True:
         with suppress(OSError, asyncio.IncompleteReadError):
-            reader, writer = await _connected(assault, tls)
+            reader, writer = await _connected(assault)
             seen["opened"] += 1
             try:
                 await assault.attack.play(reader, writer)
@@ -153,19 +135,14 @@ async def _attacker(assault: Assault, tls: ssl.SSLContext | None, seen: Counter[
         await asyncio.sleep(assault.pause_s)
 
 
-async def _connected(
-    assault: Assault, tls: ssl.SSLContext | None
-) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+async def _connected(assault: Assault) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
     connection = socket.socket()
     connection.setblocking(False)
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)  # for those that do not read
     try:
         connection.bind((assault.source, 0))
         await asyncio.get_running_loop().sock_connect(connection, ("127.0.0.1", assault.port))
-        name = None if tls is None else "localhost"
-        return await asyncio.open_connection(
-            sock=connection, ssl=tls, server_hostname=name, limit=1024
-        )
+        return await asyncio.open_connection(sock=connection, limit=1024)
     except BaseException:
         connection.close()
         raise
@@ -228,8 +205,7 @@ def _unread(request: bytes) -> Play:
 
 async def _half_closed(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
     writer.write(_POST)
-    if writer.can_write_eof():  # TLS has no half of a connection
-        writer.write_eof()
+    writer.write_eof()
     await _until_closed(reader)
 
 
@@ -308,7 +284,6 @@ ATTACKS = (
         _flood(_POST + b"Transfer-Encoding: chunked\r\n\r\n", lambda _: b"1\r\n \r\n"),
         is_flood=True,
     ),
-    Attack("begin a TLS handshake", "HTTP", _slowly(b"\x16\x03\x01\x02", b"\0\1"), hides_tls=True),
     Attack("say hello and nothing else", "gRPC", _slowly(_HELLO, b"")),
     Attack("send HTTP/2's preface, a byte a second", "gRPC", _slowly(b"", _PREFACE)),
     Attack(

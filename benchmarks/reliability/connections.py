@@ -5,8 +5,6 @@ from __future__ import annotations
 import asyncio
 import os
 import re
-import resource
-import subprocess
 import time
 from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
@@ -37,7 +35,7 @@ _PROBE_EVERY_S = 0.5
 # gRPC itself refuses what comes in the moment in which all its places are taken.
 _REFUSED_BY_GRPC = 1
 _WARM_S = 3.0
-OWN_ADDRESS, ANOTHER_ADDRESS = "127.0.0.1", "127.0.0.2"
+ANOTHER_ADDRESS = "127.0.0.2"  # than that of honest clients
 
 
 @dataclass(frozen=True)
@@ -63,8 +61,7 @@ class Besieged:
 
     Attributes:
         service: its process.
-        front: where callers find it: the service itself, or the balancer before it.
-        source: the address from which it is attacked.
+        front: the balancer before it.
         doors: to the front.
         cases: what honest clients ask.
         expected: what they are answered.
@@ -73,57 +70,10 @@ class Besieged:
 
     service: ServiceProcess
     front: Addresses
-    source: str
     doors: Doors
     cases: Sequence[Case]
     expected: Expected
     metrics_port: int
-
-
-async def connections(
-    maps: SampleMaps,
-    work: Path,
-    strength: Strength,
-    limits: Sequence[int] = (1024, 65536),
-    *,
-    tls: Sequence[bool] = (False, True),
-) -> list[Check]:
-    """Attack a service in every way, alone in its process for each limit of open files.
-
-    Args:
-        maps: to serve.
-        work: folder for logs and a certificate.
-        strength: how strong the attacks are.
-        limits: of open files; instead of more than this process may have, as many as it may.
-        tls: whether the service speaks it.
-    """
-    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
-    checks = []
-    for limit in limits:
-        for with_tls in tls:
-            checks += await _withstood(maps, work, min(limit, most), with_tls, strength)
-    return checks
-
-
-async def _withstood(
-    maps: SampleMaps, work: Path, limit: int, with_tls: bool, strength: Strength
-) -> list[Check]:
-    where = f"{limit} files, {'TLS' if with_tls else 'no TLS'}"
-    log = work / f"service-{limit}-{with_tls}.log"
-    metrics_port = free_port()
-    own = certificate(work) if with_tls else None
-    before = ["bash", "-c", f'ulimit -n {limit}\nexec "$@"', "-"]
-    with (
-        _cores_apart() as part,
-        ServiceProcess(
-            maps.folder, log, before=before, certificate=own, metrics_port=metrics_port
-        ) as service,
-    ):
-        part()
-        return await _attacked_in_turn(
-            where, maps, service, service.addresses, OWN_ADDRESS, metrics_port, strength
-        )
 
 
 @contextmanager
@@ -143,8 +93,8 @@ def _cores_apart() -> Iterator[Callable[[], None]]:
         os.sched_setaffinity(0, cores)
 
 
-async def behind_balancer(maps: SampleMaps, work: Path, strength: Strength) -> list[Check]:
-    """Attack a service through the balancer that comes with it, all from one address."""
+async def connections(maps: SampleMaps, work: Path, strength: Strength) -> list[Check]:
+    """Attack a service through the balancer that comes with it in every way, from one address."""
     metrics_port = free_port()
     with (
         _cores_apart() as part,
@@ -152,17 +102,13 @@ async def behind_balancer(maps: SampleMaps, work: Path, strength: Strength) -> l
     ):
         part()
         [service] = found.replicas
-        return await _attacked_in_turn(
-            "balancer", maps, service, found.front, ANOTHER_ADDRESS, metrics_port, strength
-        )
+        return await _attacked_in_turn(maps, service, found.front, metrics_port, strength)
 
 
 async def _attacked_in_turn(
-    where: str,
     maps: SampleMaps,
     service: ServiceProcess,
     front: Addresses,
-    source: str,
     metrics_port: int,
     strength: Strength,
 ) -> list[Check]:
@@ -170,12 +116,10 @@ async def _attacked_in_turn(
     checks = []
     async with Doors(front) as doors:
         expected = await unloaded_answers(doors, maps, cases)
-        besieged = Besieged(service, front, source, doors, cases, expected, metrics_port)
+        besieged = Besieged(service, front, doors, cases, expected, metrics_port)
         await ask_in_turn(doors, cases, 1, _WARM_S)
         for attack in (each for each in ATTACKS if strength.kinds in each.name):
-            if front.trust is not None or not attack.hides_tls:
-                check = await _attack(besieged, attack, strength)
-                checks.append(Check(f"{where}: {check[0]}", *check[1:]))
+            checks.append(Check(*await _attack(besieged, attack, strength)))
     return checks
 
 
@@ -189,8 +133,7 @@ async def _attack(besieged: Besieged, attack: Attack, strength: Strength) -> tup
     front = besieged.front
     port = front.http_port if attack.api == "HTTP" else front.grpc_port
     number = FLOODING if attack.is_flood else strength.count // attack.one_in
-    has_tls = front.trust is not None
-    assault = Assault(attack.name, port, number, has_tls, strength.pause_s, besieged.source)
+    assault = Assault(attack.name, port, number, strength.pause_s, ANOTHER_ADDRESS)
     worked_s = service.processor_seconds()
     async with attacked([assault]) as seen:
         await asyncio.sleep(1)
@@ -219,28 +162,13 @@ async def _attack(besieged: Besieged, attack: Attack, strength: Strength) -> tup
     )
 
 
-def certificate(work: Path) -> tuple[Path, Path]:
-    """Make a certificate for this machine; the files of it and of its key."""
-    cert, key = work / "cert.pem", work / "key.pem"
-    subprocess.run(
-        [
-            *("openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "30"),
-            *("-keyout", key, "-out", cert, "-subj", "/CN=localhost"),
-            *("-addext", "subjectAltName=DNS:localhost,IP:127.0.0.1"),
-        ],
-        check=True,
-        capture_output=True,
-    )
-    return cert, key
-
-
 async def probed(besieged: Besieged, seconds: float) -> Mapping[str, list[float]]:
     """Ask for health and metrics over new connections; the seconds of each, infinity for failed."""
     front, metrics = besieged.front, f"http://127.0.0.1:{besieged.metrics_port}/metrics"
     asked: dict[str, Callable[[], Awaitable[None]]] = {
-        "/healthz": lambda: _get(f"{front.url}/healthz", front),
-        "/readyz": lambda: _get(f"{front.url}/readyz", front),
-        "metrics": lambda: _get(metrics, front),
+        "/healthz": lambda: _get(f"{front.url}/healthz"),
+        "/readyz": lambda: _get(f"{front.url}/readyz"),
+        "metrics": lambda: _get(metrics),
         "gRPC health": lambda: _check(front),
     }
     found = await asyncio.gather(*(_probed(probe, seconds) for probe in asked.values()))
@@ -259,8 +187,8 @@ async def _probed(probe: Callable[[], Awaitable[None]], seconds: float) -> list[
     return found
 
 
-async def _get(url: str, front: Addresses) -> None:
-    async with httpx.AsyncClient(timeout=5, verify=front.tls()) as http:
+async def _get(url: str) -> None:
+    async with httpx.AsyncClient(timeout=5) as http:
         (await http.get(url)).raise_for_status()
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import socket
-import ssl
 import subprocess
 import sys
 import time
@@ -29,24 +28,16 @@ class Addresses:
         url: of its HTTP API.
         http_port: the port in it.
         grpc: host and port.
-        trust: its certificate, where it speaks TLS.
     """
 
     url: str
     http_port: int
     grpc: str
-    trust: bytes | None = None
 
     @property
     def grpc_port(self) -> int:
         """The port of ``grpc``."""
         return int(self.grpc.rpartition(":")[2])
-
-    def tls(self) -> ssl.SSLContext | bool:
-        """What a client needs to trust it: its certificate, if it has one."""
-        if self.trust is None:
-            return False
-        return ssl.create_default_context(cadata=self.trust.decode())
 
 
 class ServiceProcess:
@@ -59,12 +50,8 @@ class ServiceProcess:
         ports: of HTTP and gRPC; free ones when None.
         before: words before the command, such as ``unshare``'s.
         environment: variables besides this process's own.
-        certificate: PEM files of a certificate and its key, for TLS.
         ready_within_s: after which it is taken for broken.
         settings: further settings, by name; None leaves the service's own default.
-
-    Attributes:
-        trust: its certificate, where it speaks TLS.
     """
 
     def __init__(
@@ -76,17 +63,12 @@ class ServiceProcess:
         ports: tuple[int, int] | None = None,
         before: Sequence[str] = (),
         environment: Mapping[str, str] | None = None,
-        certificate: tuple[Path, Path] | None = None,
         ready_within_s: float = READY_WITHIN_S,
         **settings: object,
     ) -> None:
         self.http_port, self.grpc_port = ports or (free_port(), free_port())
         self._ready_within_s = ready_within_s
-        self.trust: bytes | None = None
-        if certificate is not None:
-            self.trust = certificate[0].read_bytes()
-            settings |= {"tls_cert": certificate[0], "tls_key": certificate[1]}
-        self.url = f"{'http' if certificate is None else 'https'}://{host}:{self.http_port}"
+        self.url = f"http://{host}:{self.http_port}"
         self.grpc = f"{host}:{self.grpc_port}"
         self.log = log
         given = {
@@ -125,7 +107,7 @@ class ServiceProcess:
     @property
     def addresses(self) -> Addresses:
         """Where it is."""
-        return Addresses(self.url, self.http_port, self.grpc, self.trust)
+        return Addresses(self.url, self.http_port, self.grpc)
 
     def start(self) -> None:
         """Begin; the doors may be closed yet."""
@@ -150,9 +132,7 @@ class ServiceProcess:
     def is_ready(self) -> bool:
         """Whether /readyz says so."""
         try:
-            return httpx.get(
-                f"{self.url}/readyz", timeout=5, verify=self.addresses.tls()
-            ).is_success
+            return httpx.get(f"{self.url}/readyz", timeout=5).is_success
         except httpx.TransportError:
             return False
 

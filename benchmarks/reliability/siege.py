@@ -134,7 +134,6 @@ async def _harm(
                         source=ANOTHER_ADDRESS,
                     )
                     for attack in ATTACKS
-                    if not attack.hides_tls
                 ]
             )
         )

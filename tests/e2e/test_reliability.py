@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -17,6 +18,10 @@ from benchmarks.reliability.siege import siege
 from benchmarks.reliability.uploads import full_disk, truncated_upload
 
 pytestmark = pytest.mark.slow
+NEEDS_HAPROXY = pytest.mark.skipif(
+    shutil.which("haproxy") is None,
+    reason="needs HAProxy; on Debian and Ubuntu `make balancer`, as root, installs it",
+)
 
 
 @pytest.fixture(scope="module")
@@ -49,14 +54,14 @@ def test_a_killed_service_comes_back_with_all_that_was_published(
     assert broken(asyncio.run(kill_service(maps, tmp_path, kills=2))) == []
 
 
-@pytest.mark.parametrize("tls", [False, True])
+@NEEDS_HAPROXY
 def test_connections_that_are_idle_slow_or_flooding_shut_nobody_out(
-    maps: SampleMaps, tmp_path: Path, tls: bool
+    maps: SampleMaps, tmp_path: Path
 ) -> None:
-    checks = asyncio.run(connections(maps, tmp_path, Strength(1200, 4), limits=[1024], tls=[tls]))
-    assert broken(checks) == []
+    assert broken(asyncio.run(connections(maps, tmp_path, Strength(1200, 4)))) == []
 
 
+@NEEDS_HAPROXY
 def test_a_siege_costs_no_answer_and_no_publication(maps: SampleMaps, tmp_path: Path) -> None:
     assert broken(asyncio.run(siege(maps, tmp_path, seconds=60))) == []
 
