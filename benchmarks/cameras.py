@@ -50,7 +50,7 @@ from visloc.photos.reading import read_photo_file
 from visloc.pose.motion import position_covariance
 from visloc.priors import NO_PRIORS
 from visloc.sequences.filling import TimeUnit
-from visloc.sequences.solver import SeenInstant, SequenceSolver
+from visloc.sequences.solver import MapSequenceSolver, SeenInstant
 from visloc.types import Localized
 
 QUERIES, ROWS_MS, BANDS = 10, 20.0, 24
@@ -209,7 +209,7 @@ def sequence(places: Places, _: Path) -> Iterator[Row]:
     localizer = open_map(SAMPLE, places.maps).localizer
     for zoom_by in (1.0, 1.003, 1.005):
         name = f"focal length {100 * (zoom_by - 1):+.1f} %"
-        solver = SequenceSolver(
+        solver = MapSequenceSolver(
             localizer.geometry,
             metric=True,
             options=LocalizeOptions(),

@@ -25,7 +25,6 @@ from visloc.types import (
     Near,
     QueryFeatures,
     Refusal,
-    RigPose,
     RigSensor,
 )
 
@@ -40,9 +39,13 @@ Where = tuple[str, ...] | Near
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PackedQuery:
-    """A decoded photo and the features found so far, pickled by one worker for another."""
+    """A photo as it was sent, with the features found so far, pickled by a worker for others.
 
-    data: bytes
+    Its pixels, which take much more memory, are decoded again where they are needed.
+    """
+
+    sent: bytes | MaskedImage | QueryFeatures
+    found: bytes
 
 
 # An encoded photo, or features that were sent instead of it; packed once tiles were ranked by it.
@@ -276,6 +279,8 @@ class RankedTiles(NamedTuple):
 
 # Matches of an image with each map. Pickled, because only worker processes read it.
 PackedLooks = bytes
+# What a map makes of an instant of a sequence, likewise.
+PackedSolved = bytes
 # A sequence between two of its instants. The main process keeps it pickled, so that any worker can
 # take its next step, and a worker that dies loses only that step.
 PackedSequence = bytes
@@ -287,13 +292,11 @@ class SequenceStep(NamedTuple):
     Attributes:
         maps: references of those that are still searched.
         answers: those that are final.
-        pose: what the instant's own images measured; None when they do not localize it.
     """
 
     sequence: PackedSequence
     maps: tuple[str, ...]
     answers: list[Localization]
-    pose: RigPose | None
 
 
 class Signals(ctypes.Structure):

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from service.engine.catalog import Catalog
 from service.engine.instant_tasks import localize_in
 from service.engine.scenes import Scenes
-from service.engine.sequences import answers_in_maps, in_turn
-from service.engine.set_sequences import SetSequence
+from service.engine.sequences import SequenceInMaps, SequenceSearch, answers_in_order
+from service.engine.set_sequences import SequenceInSet
 from service.engine.sets import SetSearch, answers_of, parted
 from service.engine.uploads import Uploads
 from service.errors import stopping_error
@@ -155,8 +155,8 @@ class Engine:
 
     @property
     def waiting(self) -> int:
-        """Number of photos that wait for a worker process, or for room to be decoded for a set."""
-        return self.workers.waiting + self._sets.waiting
+        """Number of photos that wait for a worker process."""
+        return self.workers.waiting
 
     @property
     def batches(self) -> int:
@@ -249,9 +249,9 @@ class Engine:
         """Answer the instants of a sequence in order, each as soon as its answer is final.
 
         Call it within ``admit_batch``. It takes the next instant only after the caller took the
-        previous answers. A list of instants is checked before any work. In a set of maps, only the
-        order of instants and the names of tiles are checked. With several maps, answers wait until
-        only one map explains an instant; that map localizes the rest of the sequence.
+        previous answers. A list of instants is checked before any work. In a set of maps, only
+        their number and order and the names of tiles are checked. With several maps, answers wait
+        until only one map explains an instant; that map localizes the rest of the sequence.
 
         Raises:
             InvalidInput: ``sequence.*``, ``rig.*``, ``options.*``, ``priors.*``.
@@ -269,13 +269,10 @@ class Engine:
                     got=", ".join(each.ref for each in maps),
                 )
             if sets:
-                sequence = SetSequence(self._sets, self._catalog, self.workers, start, sets[0])
-                if isinstance(instants, Sequence):
-                    sequence.check(instants)
-                found = sequence.answers(in_turn(instants))
+                search: SequenceSearch = SequenceInSet(self._sets, self.workers, start, sets[0])
             else:
-                found = answers_in_maps(self.workers, start, instants, alone)
-            async with aclosing(found) as answers:
+                search = SequenceInMaps(self.workers, start, alone)
+            async with aclosing(answers_in_order(search, instants)) as answers:
                 turn = Turn()  # asked of each time: another task of asyncio may take an answer
                 while True:
                     with using_turn(turn):

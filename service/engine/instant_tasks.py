@@ -26,10 +26,17 @@ async def localize_in(workers: Workers, job: RigJob, maps: tuple[MapFolder, ...]
     """
     if job.rig is None:
         return await workers.run(Vision.localize, job, maps, time())
+    bare, looks = await check_and_look(workers, job, maps)
+    return await workers.run(Vision.solve_rig, bare, maps, looks)
+
+
+async def check_and_look(
+    workers: Workers, job: RigJob, maps: tuple[MapFolder, ...]
+) -> tuple[RigJob, list[PackedLooks]]:
+    """Check an instant, then look at all its images; return it without them, and the looks."""
     bare = replace(job, images=without_photos(job.images))
     await workers.run(Vision.check_rig, bare, maps)
-    looks = await look(workers, maps, job.rig, job.images, job.options, job.priors)
-    return await workers.run(Vision.solve_rig, bare, maps, looks)
+    return bare, await look(workers, maps, job.rig, job.images, job.options, job.priors)
 
 
 async def look(

@@ -1,67 +1,121 @@
-"""A sequence through maps, in the main process: one task after another for each instant."""
+"""A sequence in the main process: one task after another for each instant."""
 
 from __future__ import annotations
 
 from collections.abc import AsyncGenerator, AsyncIterator, Sequence
 from dataclasses import replace
+from typing import Protocol
 
 from service.engine.instant_tasks import look, without_photos
-from service.engine.sets import check_no_tiles
-from service.values import InstantJob, Localization, MapFolder, SequenceJob
+from service.values import InstantJob, Localization, MapFolder, PackedSequence, SequenceJob
 from service.workers.pool import Workers
 from service.workers.tasks import Vision
-from visloc.errors import VislocError
-from visloc.priors import NO_PRIORS
+from visloc.errors import VislocError, refuse
+from visloc.priors import NO_PRIORS, Priors
 
 
-async def answers_in_maps(
-    workers: Workers,
-    start: SequenceJob,
-    instants: AsyncIterator[InstantJob] | Sequence[InstantJob],
-    maps: tuple[MapFolder, ...],
+class SequenceSearch(Protocol):
+    """Where a sequence is localized. Instants to check and to add come in order."""
+
+    async def check(self, first: int, instants: Sequence[InstantJob]) -> None:
+        """Refuse instants, the first of this index, that cannot be solved, before any work."""
+
+    async def add(self, index: int, instant: InstantJob) -> Sequence[Localization]:
+        """Localize the next instant; return the answers that are final now."""
+
+    async def finish(self) -> Sequence[Localization]:
+        """Return the answers that are still waiting, when no more instants come."""
+
+
+async def answers_in_order(
+    search: SequenceSearch, instants: AsyncIterator[InstantJob] | Sequence[InstantJob]
 ) -> AsyncGenerator[Localization]:
     """Answer instants in order, each as soon as its answer is final.
 
-    Arguments and errors are as in ``Engine.localize_sequence``.
+    Errors are as in ``Engine.localize_sequence``.
     """
-    sequence = await workers.run(Vision.open_sequence, start, maps)
     if isinstance(instants, Sequence):
-        for instant in instants:
-            check_no_tiles(maps, instant.priors or NO_PRIORS)
-        bare = [replace(each, images=without_photos(each.images)) for each in instants]
-        sequence, _ = await workers.run(Vision.check_instants, sequence, maps, 0, bare)
+        await search.check(0, instants)
     index = 0
     try:
-        async for instant in in_turn(instants):
-            bare = [replace(instant, images=without_photos(instant.images))]
-            sequence, (priors,) = await workers.run(
-                Vision.check_instants, sequence, maps, index, bare
-            )
-            check_no_tiles(maps, priors)
-            looks = await look(workers, maps, start.rig, instant.images, start.options, priors)
-            step = await workers.run(Vision.add_instant, sequence, maps, bare[0], looks, priors)
-            sequence = step.sequence
-            maps = tuple(each for each in maps if each.ref in step.maps)
-            for answer in step.answers:
+        async for instant in _in_turn(instants):
+            for answer in await search.add(index, instant):
                 yield answer
             index += 1
     except VislocError:
         # An error of one instant does not discard the answers before it.
         if index > 0:
-            for answer in await workers.run(Vision.finish_sequence, sequence, maps):
+            for answer in await search.finish():
                 yield answer
         raise
-    for answer in await workers.run(Vision.finish_sequence, sequence, maps):
+    for answer in await search.finish():
         yield answer
 
 
-def in_turn(
+class SequenceInMaps:
+    """A sequence in one map, or in several until one of them is settled on."""
+
+    def __init__(self, workers: Workers, start: SequenceJob, maps: tuple[MapFolder, ...]) -> None:
+        self._workers, self._start, self._maps = workers, start, maps
+        self._sequence: PackedSequence | None = None
+
+    async def check(self, first: int, instants: Sequence[InstantJob]) -> None:
+        for instant in instants:
+            check_no_tiles(self._maps, instant.priors or NO_PRIORS)
+        await self._checked(first, instants)
+
+    async def add(self, index: int, instant: InstantJob) -> Sequence[Localization]:
+        workers, start = self._workers, self._start
+        (priors,) = await self._checked(index, [instant])
+        check_no_tiles(self._maps, priors)
+        looks = await look(workers, self._maps, start.rig, instant.images, start.options, priors)
+        step = await workers.run(
+            Vision.add_instant, await self._opened(), self._maps, _bare(instant), looks, priors
+        )
+        self._sequence = step.sequence
+        self._maps = tuple(each for each in self._maps if each.ref in step.maps)
+        return step.answers
+
+    async def finish(self) -> Sequence[Localization]:
+        sequence = await self._opened()
+        return await self._workers.run(Vision.finish_sequence, sequence, self._maps)
+
+    async def _opened(self) -> PackedSequence:
+        if self._sequence is None:
+            self._sequence = await self._workers.run(Vision.open_sequence, self._start, self._maps)
+        return self._sequence
+
+    async def _checked(self, first: int, instants: Sequence[InstantJob]) -> list[Priors]:
+        bare = [_bare(instant) for instant in instants]
+        self._sequence, priors = await self._workers.run(
+            Vision.check_instants, await self._opened(), self._maps, first, bare
+        )
+        return priors
+
+
+def check_no_tiles(maps: Sequence[MapFolder], priors: Priors) -> None:
+    """Refuse priors that name tiles for maps that have none."""
+    if priors.maps is not None:
+        raise refuse(
+            "priors.maps",
+            "only a set of maps has tiles",
+            field="priors.maps",
+            expected="a set of maps, or none of this",
+            got=", ".join(each.ref for each in maps),
+        )
+
+
+def _bare(instant: InstantJob) -> InstantJob:
+    """Return an instant for checks and tasks that do not need its photos."""
+    return replace(instant, images=without_photos(instant.images))
+
+
+async def _in_turn(
     instants: AsyncIterator[InstantJob] | Sequence[InstantJob],
-) -> AsyncIterator[InstantJob]:
-    """Return an iterator over the instants of a list or a stream."""
-    return _one_by_one(instants) if isinstance(instants, Sequence) else instants
-
-
-async def _one_by_one(instants: Sequence[InstantJob]) -> AsyncGenerator[InstantJob]:
-    for instant in instants:
-        yield instant
+) -> AsyncGenerator[InstantJob]:
+    if isinstance(instants, Sequence):
+        for instant in instants:
+            yield instant
+    else:
+        async for instant in instants:
+            yield instant

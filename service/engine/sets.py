@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from service.engine.catalog import Catalog
 from service.engine.instant_tasks import localize_in, together
-from service.engine.set_photos import SetPhotos, Slots
+from service.engine.sequences import check_no_tiles
+from service.engine.set_photos import SetPhotos
 from service.telemetry.metrics import Metrics
 from service.values import ImageJob, Localization, MapFolder, Query, Rig, RigJob, Where
 from service.workers.judging import agree, judged, without_coarse
@@ -36,7 +37,7 @@ from visloc.errors import (
     VislocError,
     refuse,
 )
-from visloc.options import LocalizeOptions, ReadAs
+from visloc.options import ReadAs
 from visloc.priors import Priors
 from visloc.runtime.threads import summed
 from visloc.sets.choosing import (
@@ -86,18 +87,14 @@ class SetSearch:
 
     def __init__(self, catalog: Catalog, workers: Workers, metrics: Metrics) -> None:
         self._catalog, self._workers, self._metrics = catalog, workers, metrics
-        self._slots = Slots(workers.count + 1)
 
-    @property
-    def waiting(self) -> int:
-        """Number of photos that wait for room to be decoded."""
-        return self._slots.waiting
+    def outline(self, map_set: MapFolder) -> SetOutline:
+        return self._catalog.set_outline(map_set)
 
-    def decoding(
-        self, map_set: MapFolder, queries: Sequence[Query], options: LocalizeOptions
-    ) -> SetPhotos:
-        """Return photos that hold room to be decoded within ``async with``."""
-        return SetPhotos(self._slots, self._workers, map_set, queries, options)
+    def photos(self, map_set: MapFolder, job: RigJob) -> SetPhotos:
+        """Return the photos of a request."""
+        queries = [image.query for image in job.images]
+        return SetPhotos(self._workers, map_set, queries, job.options)
 
     async def within(self, outline: SetOutline, where: Where) -> NDArray[np.bool_] | None:
         """Return which tiles (T,) lie near the place that a request names; None without a place."""
@@ -130,27 +127,26 @@ class SetSearch:
             )
             return await localize_in(self._workers, asked, (folder,))
 
-        queries = [image.query for image in job.images]
-        async with self.decoding(map_set, queries, job.options) as photos:
-            choice = await self.choose(photos, allowed)
-            tries_turns = job.rig is None and job.options.read_as is ReadAs.ANY
-            if choice.blind or np.count_nonzero(allowed) == 1 or not tries_turns:
-                return (await self.search(outline, choice, photos, partial(ask, job)))[1]
-            # As it was sent, the photo is searched in all tiles first. Otherwise each tile would
-            # look at turns of a photo that shows the next one.
-            upright = replace(job, options=replace(job.options, read_as=ReadAs.UPRIGHT))
-            _, found = await self.search(outline, choice, photos, partial(ask, upright))
-            refused, began = found.answer.refusal, perf_counter()
-            if refused is None:
-                return found
-            choice = await self.choose(photos, allowed, refused)
-            if choice.blind:
-                return found
-            left = replace(job, refused=refused)
-            _, turned = await self.search(outline, choice, photos, partial(ask, left))
-            if turned.answer.pose is not None or _is_ambiguous(turned):
-                return turned
-            return _with_turns(found, perf_counter() - began)
+        photos = self.photos(map_set, job)
+        choice = await self.choose(photos, allowed)
+        tries_turns = job.rig is None and job.options.read_as is ReadAs.ANY
+        if choice.blind or np.count_nonzero(allowed) == 1 or not tries_turns:
+            return (await self.search(outline, choice, photos, partial(ask, job)))[1]
+        # As it was sent, the photo is searched in all tiles first. Otherwise each tile would
+        # look at turns of a photo that shows the next one.
+        upright = replace(job, options=replace(job.options, read_as=ReadAs.UPRIGHT))
+        _, found = await self.search(outline, choice, photos, partial(ask, upright))
+        refused, began = found.answer.refusal, perf_counter()
+        if refused is None:
+            return found
+        choice = await self.choose(photos, allowed, refused)
+        if choice.blind:
+            return found
+        left = replace(job, refused=refused)
+        _, turned = await self.search(outline, choice, photos, partial(ask, left))
+        if turned.answer.pose is not None or _is_ambiguous(turned):
+            return turned
+        return _with_turns(found, perf_counter() - began)
 
     async def choose(
         self,
@@ -234,7 +230,7 @@ class SetSearch:
         """Search tiles concurrently; return the error of one that cannot be searched."""
         fetcher = self._catalog.fetcher
         away = await fetcher.away([outline.tiles[row].ref for row in rows])
-        failed = await photos.aside(fetcher.fetch(away)) if away else {}
+        failed = await fetcher.fetch(away) if away else {}
 
         async def search(row: int) -> tuple[int, Localization | VislocError]:
             tile = outline.tiles[row]
@@ -317,18 +313,6 @@ def parted(
     if alone:
         check_no_tiles(alone, priors)
     return sets, alone
-
-
-def check_no_tiles(maps: Sequence[MapFolder], priors: Priors) -> None:
-    """Refuse priors that name tiles for maps that have none."""
-    if priors.maps is not None:
-        raise refuse(
-            "priors.maps",
-            "only a set of maps has tiles",
-            field="priors.maps",
-            expected="a set of maps, or none of this",
-            got=", ".join(each.ref for each in maps),
-        )
 
 
 def in_set(found: Localization, outline: SetOutline, tile: TileRecord) -> Localization:

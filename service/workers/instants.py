@@ -6,6 +6,10 @@ import pickle
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from service.values import ONLY_SENSOR, ImageJob, Localization, PackedQuery, Query, Rig, RigJob
 from visloc.archive import Map
@@ -17,7 +21,7 @@ from visloc.localization.localizer import Localizer
 from visloc.localization.map_view.constraints import Constraints
 from visloc.localization.query.camera import MapCamera, resolve_camera
 from visloc.localization.query.feature_cache import FeatureCache
-from visloc.localization.solving import Look, SeenImage
+from visloc.localization.solving import Look, SeenImage, Solved
 from visloc.options import LocalizeOptions
 from visloc.photos.reading import ImageLimits, Photo, read_photo, with_mask
 from visloc.priors import Priors
@@ -97,6 +101,18 @@ class Target:
         """Whether this tile is one of those that the priors name, if they name tiles."""
         opened = self.localizer.map
         return priors.maps is None or not {opened.manifest.id, opened.ref}.isdisjoint(priors.maps)
+
+
+class SolvedInMap(NamedTuple):
+    """What a map makes of an instant, in its own coordinates, which begin at ``origin``.
+
+    Attributes:
+        metric: whether the unit of the map is the metre.
+    """
+
+    solved: Solved
+    origin: NDArray[np.float64]
+    metric: bool
 
 
 def refused_before(
@@ -229,9 +245,10 @@ def decode(query: Query, limits: ImageLimits, extractor_of: ExtractorOf) -> Deco
         TooLarge: ``image.too_large``.
     """
     if isinstance(query, PackedQuery):
-        photo, found, seconds = pickle.loads(query.data)
+        found, seconds = pickle.loads(query.found)
         found = {(extractor_of(name), *how): features for (name, *how), features in found.items()}
-        return DecodedQuery(photo, found, seconds)
+        again = decode(query.sent, limits, extractor_of)
+        return DecodedQuery(again.query, found, summed(seconds, again.seconds))
     if isinstance(query, QueryFeatures):
         return DecodedQuery(query, {}, {})
     spent: dict[str, float] = {}
@@ -243,11 +260,11 @@ def decode(query: Query, limits: ImageLimits, extractor_of: ExtractorOf) -> Deco
     return DecodedQuery(photo, {}, spent)
 
 
-def pack(decoded: DecodedQuery) -> PackedQuery:
-    """Pickle a query for another process. Extractors, which each process has, go by name."""
+def pack(query: Query, decoded: DecodedQuery) -> PackedQuery:
+    """Pack a query for other processes. Extractors, which each process has, go by name."""
     found = {
         (extractor.fingerprint.name, *how): features
         for (extractor, *how), features in decoded.found.items()
     }
-    parts = decoded.query, found, decoded.seconds
-    return PackedQuery(pickle.dumps(parts, pickle.HIGHEST_PROTOCOL))
+    sent = query.sent if isinstance(query, PackedQuery) else query
+    return PackedQuery(sent, pickle.dumps((found, decoded.seconds), pickle.HIGHEST_PROTOCOL))

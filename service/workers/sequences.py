@@ -13,8 +13,8 @@ from visloc.localization.acceptance.judge import candidate, most_inliers_first
 from visloc.localization.solving import SeenImage, Solved
 from visloc.priors import Priors
 from visloc.sequences.filling import TimeUnit, guess_time_unit
-from visloc.sequences.solver import SeenInstant, SequenceSolver, check_max_gap, check_odometry
-from visloc.types import Candidate, InstantAnswer, Reason, Refusal, RigPose
+from visloc.sequences.solver import MapSequenceSolver, SeenInstant, check_max_gap, check_odometry
+from visloc.types import Candidate, InstantAnswer, Reason, Refusal
 
 
 class SequenceRun:
@@ -35,7 +35,7 @@ class SequenceRun:
         self._max_images = max_images
         self._max_instants = max_instants
         self._last_checked: tuple[int, int] | None = None  # index, timestamp
-        self._solvers: list[SequenceSolver] = []
+        self._solvers: list[MapSequenceSolver] = []
         self._held: list[list[InstantAnswer]] = [[] for _ in targets]
 
     def check(self, index: int, instant: InstantJob) -> Priors:
@@ -43,12 +43,7 @@ class SequenceRun:
 
         Instants are checked in order, which may begin again with the first.
         """
-        if index >= self._max_instants:
-            raise refuse(
-                "sequence.too_many_instants",
-                field="instants",
-                expected=f"at most {self._max_instants}",
-            )
+        check_number(index, self._max_instants)
         with inside(f"instants[{index}]"):
             before = self._last_checked
             if before is not None and before[0] < index:
@@ -68,7 +63,7 @@ class SequenceRun:
     ) -> list[InstantAnswer]:
         """Solve an instant, given its images by target; return the answers that are final now."""
         if not self._solvers:
-            unit = self._start.time_unit or _guessed_unit(instant.timestamp)
+            unit = self._start.time_unit or guessed_unit(instant.timestamp)
             self._solvers = [self._solver(target, unit) for target in self.targets]
         assert self._last_checked is not None  # it was checked before
         with inside(f"instants[{self._last_checked[0]}]"):
@@ -84,14 +79,6 @@ class SequenceRun:
         if settled is not None:
             self._keep(settled)
         return self._released() if len(self.targets) == 1 else []
-
-    @property
-    def pose(self) -> RigPose | None:
-        """The pose that the newest instant's own images measured.
-
-        None when they do not localize it, or while several maps are searched.
-        """
-        return self._solvers[0].newest if len(self._solvers) == 1 else None
 
     def finish(self) -> list[InstantAnswer]:
         """Return the answers that waited for further instants."""
@@ -153,8 +140,8 @@ class SequenceRun:
         released, self._held[0] = self._held[0], []
         return released
 
-    def _solver(self, target: Target, unit: TimeUnit) -> SequenceSolver:
-        return SequenceSolver(
+    def _solver(self, target: Target, unit: TimeUnit) -> MapSequenceSolver:
+        return MapSequenceSolver(
             target.localizer.geometry,
             metric=_is_metric(target),
             options=self._start.options,
@@ -180,7 +167,16 @@ def _is_metric(target: Target) -> bool:
     return target.localizer.map.manifest.world.metric
 
 
-def _guessed_unit(timestamp: int) -> TimeUnit:
+def check_number(index: int, max_instants: int) -> None:
+    """Refuse the instants of a sequence that are too many."""
+    if index >= max_instants:
+        raise refuse(
+            "sequence.too_many_instants", field="instants", expected=f"at most {max_instants}"
+        )
+
+
+def guessed_unit(timestamp: int) -> TimeUnit:
+    """Tell the unit of a sequence's timestamps from the first of them."""
     unit = guess_time_unit([timestamp])
     if unit is None:
         raise refuse(

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.workers.instants import DecodedQuery, ExtractorOf
-from visloc.archive import MapSet, open_map
+from service.workers.set_sequences import SetFrame
+from visloc.archive import MapSet, SetOutline, open_map
 from visloc.errors import InvalidInput, MapCorrupt
 from visloc.features import LocalFeatureExtractor
 from visloc.features.framing import Framing
@@ -73,6 +74,8 @@ class TileRanker:
         self, opened: MapSet, extractor_of: ExtractorOf, resolution: WorkingResolution | None
     ) -> None:
         self._set = opened
+        self.outline: SetOutline = opened
+        self.frame = SetFrame(opened)
         self._resolution = resolution
         self.size_bytes = opened.size_bytes  # without its tiles
         fingerprint = opened.manifest.local_features
@@ -80,6 +83,11 @@ class TileRanker:
         if not is_ready_made(fingerprint.name):
             self._extractor = extractor_of(fingerprint.name)
             check_fingerprint(fingerprint, self._extractor.fingerprint, opened.ref)
+
+    @property
+    def kept(self) -> dict[str, object]:
+        """What a sequence in the set names instead of carrying it along."""
+        return {"outline": self.outline, "frame": self.frame}
 
     def warm_up(self) -> None:
         """Run once on noise, so that the first query does not pay for the first use."""

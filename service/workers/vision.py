@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import io
 import logging
 import os
 import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from time import perf_counter, time
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +22,7 @@ from service.values import (
     OpenMap,
     PackedLooks,
     PackedSequence,
+    PackedSolved,
     Query,
     RankedTiles,
     Rig,
@@ -35,6 +34,7 @@ from service.values import (
 )
 from service.workers.instants import (
     DecodedQuery,
+    SolvedInMap,
     Target,
     check_images,
     check_options,
@@ -47,12 +47,12 @@ from service.workers.instants import (
 from service.workers.judging import gated, judged
 from service.workers.open_maps import OpenMaps
 from service.workers.sequences import SequenceRun
+from service.workers.set_sequences import SetRun
+from service.workers.state import packed, unpacked
 from visloc.drawing.matches_picture import draw_overlay
 from visloc.errors import InvalidInput, VislocError
-from visloc.localization.localizer import Localizer
-from visloc.localization.map_view.constraints import MapGeometry
 from visloc.localization.places import solve_photo
-from visloc.localization.solving import Look, SeenImage, Solved
+from visloc.localization.solving import Look, SeenImage, Solved, solve_instant
 from visloc.localization.turning import is_worth_turning
 from visloc.options import LocalizeOptions
 from visloc.photos.reading import ImageLimits, Photo
@@ -199,7 +199,8 @@ class Vision:
         """Refuse a rig's images, which come without their photos, or options that do not fit."""
         targets = self._targets(maps, job.rig)
         for target in targets:
-            check_images(job.images, target.rig, self._settings.max_images, "images")
+            rig = None if job.rig is None else target.rig
+            check_images(job.images, rig, self._settings.max_images, "images")
         check_options(targets, job.options)
         check_priors(targets, job.priors)
 
@@ -231,6 +232,23 @@ class Vision:
         """Estimate one pose of a rig, given without its photos, in the best of the maps."""
         targets = self._targets(maps, job.rig)
         return self._solve(job, targets, _by_map(looks, len(maps)))[1]
+
+    def solve_instant(
+        self, job: RigJob, version: MapFolder, looks: Sequence[PackedLooks], cameras: bytes
+    ) -> tuple[Localization, PackedSolved]:
+        """Solve an instant of a sequence in one of many maps, as ``solve_rig`` does.
+
+        ``cameras``, pickled, is what earlier instants said of theirs.
+        """
+        self._step()
+        (target,), (images,) = self._targets([version], job.rig), _by_map(looks, 1)
+        geometry, options = target.localizer.geometry, job.options.before_rivals()
+        solved = solve_instant(
+            images, geometry, options, job.priors, job.timestamp, pickle.loads(cameras)
+        )
+        metric = target.localizer.map.manifest.world.metric
+        told = pickle.dumps(SolvedInMap(solved, geometry.origin, metric), pickle.HIGHEST_PROTOCOL)
+        return target.localization(solved.answer, ypr=job.ypr), told
 
     def _solve(
         self, job: RigJob, targets: Sequence[Target], seen: Sequence[tuple[SeenImage, ...]]
@@ -293,12 +311,54 @@ class Vision:
             scores = ranker.rank_turned(decoded, options, allowed, self._step)
         else:
             scores = ()
-        return RankedTiles(pack(decoded), scores)
+        return RankedTiles(pack(query, decoded), scores)
+
+    def open_in_set(self, start: SequenceJob, map_set: MapFolder) -> PackedSequence:
+        """Begin a sequence in a set."""
+        opened = self._maps.ranker(map_set)
+        return packed(SetRun(start, opened.outline, opened.frame), opened.kept)
+
+    def check_in_set(
+        self,
+        sequence: PackedSequence,
+        map_set: MapFolder,
+        first: int,
+        instants: Sequence[InstantJob],
+    ) -> tuple[PackedSequence, list[Priors], bytes]:
+        """Refuse instants as ``check_instants`` does; also return what is known of the cameras."""
+        kept = self._maps.ranker(map_set).kept
+        run: SetRun = unpacked(sequence, kept)
+        most = self._settings.max_instants
+        priors = [run.check(first + i, instant, most) for i, instant in enumerate(instants)]
+        return packed(run, kept), priors, run.cameras
+
+    def add_in_set(
+        self,
+        sequence: PackedSequence,
+        map_set: MapFolder,
+        instant: InstantJob,
+        row: int,
+        found: Localization,
+        solved: PackedSolved,
+        priors: Priors,
+    ) -> tuple[PackedSequence, list[Localization]]:
+        """Take the next instant of a sequence, which the tile of this row solved."""
+        self._step()
+        kept = self._maps.ranker(map_set).kept
+        run: SetRun = unpacked(sequence, kept)
+        answers = run.add(instant, row, found, solved, priors)
+        return packed(run, kept), answers
+
+    def finish_in_set(self, sequence: PackedSequence, map_set: MapFolder) -> list[Localization]:
+        """Return the answers that are still waiting, when no more instants come."""
+        run: SetRun = unpacked(sequence, self._maps.ranker(map_set).kept)
+        return run.finish()
 
     def open_sequence(self, start: SequenceJob, maps: Sequence[MapFolder]) -> PackedSequence:
         settings = self._settings
         targets = self._targets(maps, start.rig)
-        return _packed(SequenceRun(start, targets, settings.max_images, settings.max_instants))
+        run = SequenceRun(start, targets, settings.max_images, settings.max_instants)
+        return packed(run, self._kept(maps))
 
     def check_instants(
         self,
@@ -310,7 +370,7 @@ class Vision:
         """Refuse instants, without their photos, that cannot be solved; return their priors."""
         run = self._sequence(sequence, maps)
         priors = [run.check(first + i, instant) for i, instant in enumerate(instants)]
-        return _packed(run), priors
+        return packed(run, self._kept(maps)), priors
 
     def add_instant(
         self,
@@ -326,7 +386,7 @@ class Vision:
         found = run.add(instant, _by_map(looks, len(maps)), priors)
         answers = [run.localization(answer) for answer in found]
         kept = tuple(target.localizer.map.ref for target in run.targets)
-        return SequenceStep(_packed(run), kept, answers, run.pose)
+        return SequenceStep(packed(run, self._kept(maps)), kept, answers)
 
     def finish_sequence(
         self, sequence: PackedSequence, maps: Sequence[MapFolder]
@@ -336,9 +396,16 @@ class Vision:
         return [run.localization(answer) for answer in run.finish()]
 
     def _sequence(self, state: PackedSequence, maps: Sequence[MapFolder]) -> SequenceRun:
-        run = _Unpickler(state, {one.ref: self._maps.localizer(one) for one in maps}).load()
-        assert isinstance(run, SequenceRun)
+        run: SequenceRun = unpacked(state, self._kept(maps))
         return run
+
+    def _kept(self, maps: Sequence[MapFolder]) -> dict[str, object]:
+        """Return what this process has open of maps, by names that all processes share."""
+        kept: dict[str, object] = {}
+        for one in maps:
+            localizer = self._maps.localizer(one)
+            kept |= {f"localizer {one.ref}": localizer, f"geometry {one.ref}": localizer.geometry}
+        return kept
 
     def _step(self) -> None:
         """Stop here when nobody waits any more."""
@@ -353,36 +420,6 @@ class Vision:
     def _targets(self, maps: Sequence[MapFolder], rig: Rig | None) -> list[Target]:
         localizers = [self._maps.localizer(one) for one in maps]
         return [Target(found, rig_in_map(rig, found.map)) for found in localizers]
-
-
-class _Pickler(pickle.Pickler):
-    """Pickles a sequence with references to its maps."""
-
-    def persistent_id(self, obj: Any) -> Any:
-        if isinstance(obj, Localizer):
-            return "localizer", obj.map.ref
-        if isinstance(obj, MapGeometry):
-            return "geometry", obj.ref
-        return None
-
-
-class _Unpickler(pickle.Unpickler):
-    """Inserts this process's maps. Reads only what ``_Pickler`` wrote, in this service."""
-
-    def __init__(self, state: bytes, localizers: Mapping[str, Localizer]) -> None:
-        super().__init__(io.BytesIO(state))
-        self._localizers = localizers
-
-    def persistent_load(self, pid: Any) -> Any:
-        kind, ref = pid
-        localizer = self._localizers[ref]
-        return localizer if kind == "localizer" else localizer.geometry
-
-
-def _packed(run: SequenceRun) -> PackedSequence:
-    buffer = io.BytesIO()
-    _Pickler(buffer, pickle.HIGHEST_PROTOCOL).dump(run)
-    return buffer.getvalue()
 
 
 def _by_map(looks: Sequence[PackedLooks], num_maps: int) -> list[tuple[SeenImage, ...]]:

@@ -26,7 +26,7 @@ from visloc.localization.query.camera import guessed_camera
 from visloc.localization.turning import REASONS_OF_TURNED_PHOTOS
 from visloc.options import LocalizeOptions, ReadAs, Solver
 from visloc.pose.generalized import GeneralizedPose
-from visloc.pose.motion import position_covariance, with_origin
+from visloc.pose.motion import MapErrors, position_covariance, with_origin
 from visloc.pose.reprojection import MatchedView
 from visloc.priors import Priors
 from visloc.runtime.threads import summed, timed
@@ -40,6 +40,7 @@ from visloc.types import (
     Reason,
     Refusal,
     RigPose,
+    Uncertainty,
 )
 
 
@@ -138,6 +139,7 @@ class Solved:
         inliers: of each view, (n,) whether the best pose explains the match, even if it was
             refused; () when no pose was found.
         cameras: what this instant and those before say of their cameras.
+        errors: of the map, which ``pose`` does not have yet.
     """
 
     answer: InstantAnswer
@@ -145,6 +147,7 @@ class Solved:
     pose: GeneralizedPose | None
     inliers: tuple[NDArray[np.bool_], ...]
     cameras: CamerasSoFar
+    errors: MapErrors
 
     def refused(self, refusal: Refusal) -> Solved:
         """Return the same without its pose."""
@@ -223,7 +226,8 @@ def solve_instant(
     shown = with_inliers(_shown(images, used, estimated is not None), inliers)
     coarse = looks[0].coarse if len(looks) == 1 else None
     answer = InstantAnswer(timestamp, shown, pose, refusal, seconds, scores, coarse)
-    solved = Solved(answer, views, found if refusal is None else None, inliers, cameras)
+    found = found if refusal is None else None
+    solved = Solved(answer, views, found, inliers, cameras, geometry.errors)
     refusal = not_probable_enough(answer, options)
     return solved if refusal is None else solved.refused(refusal)
 
@@ -342,29 +346,38 @@ def measured_pose(
     """
     rig_from_local = found.rig_from_world
     whole = geometry.errors.whole(rig_from_local, photo_covariance, found.of_camera)
-    return rig_pose(rig_from_local, whole, geometry, PoseSource.ESTIMATED, photo_covariance)
+    return rig_pose(
+        rig_from_local,
+        whole,
+        geometry.origin,
+        PoseSource.ESTIMATED,
+        geometry.errors.uncertainty,
+        photo_covariance,
+    )
 
 
 def rig_pose(
     rig_from_local: Pose,
     covariance: NDArray[np.float64],
-    geometry: MapGeometry,
+    origin: NDArray[np.float64],
     source: PoseSource,
+    uncertainty: Uncertainty,
     photo_covariance: NDArray[np.float64] | None = None,
 ) -> RigPose:
-    """Move a pose from the map's own coordinates to the world.
+    """Move a pose from a frame's own coordinates to its world.
 
     Args:
         rig_from_local: the pose.
         covariance: (6, 6), the errors of the map included.
-        geometry: of the map.
+        origin: (3,) of the frame.
         source: what the pose rests on.
+        uncertainty: which errors ``covariance`` covers.
         photo_covariance: (6, 6), the part of the instant's own images, if they measured the pose.
     """
     if photo_covariance is not None:
-        _, photo_covariance = with_origin(rig_from_local, photo_covariance, geometry.origin)
+        _, photo_covariance = with_origin(rig_from_local, photo_covariance, origin)
     position_variance = np.diag(position_covariance(rig_from_local, covariance))
-    rig_from_world, covariance = with_origin(rig_from_local, covariance, geometry.origin)
+    rig_from_world, covariance = with_origin(rig_from_local, covariance, origin)
     return RigPose(
         rig_from_world,
         covariance,
@@ -372,7 +385,7 @@ def rig_pose(
         orientation_std=np.sqrt(np.diag(covariance)[:3]),
         source=source,
         photo_covariance=photo_covariance,
-        uncertainty=geometry.errors.uncertainty,
+        uncertainty=uncertainty,
     )
 
 

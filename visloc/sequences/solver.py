@@ -21,7 +21,7 @@ from visloc.geometry import center_covariance, covariance_from_center, rotation_
 from visloc.localization.acceptance.corrections import NO_CAMERAS
 from visloc.localization.acceptance.gates import contradicts_priors, registration_for
 from visloc.localization.acceptance.judge import not_probable_enough
-from visloc.localization.map_view.constraints import Constraints, MapGeometry
+from visloc.localization.map_view.constraints import Frame, MapGeometry, PosePriors
 from visloc.localization.solving import (
     SeenImage,
     Solved,
@@ -42,7 +42,7 @@ from visloc.sequences.odometry_readings import (
     narrowed,
 )
 from visloc.sequences.window import WindowInstant, WindowPose, solve_window
-from visloc.types import InstantAnswer, PoseSource, Reason, Refusal, RigPose
+from visloc.types import InstantAnswer, PoseSource, Reason, Refusal
 
 # At most this many instants wait, and as many answered ones are kept, whatever the gap: in a fast
 # sequence, those further away add little and cost time.
@@ -90,9 +90,10 @@ class _Entry(NamedTuple):
 
 
 class SequenceSolver:
-    """Takes instants one by one and returns answers in order, each when it is final.
+    """Takes solved instants one by one and returns answers in order, each when it is final.
 
     Args:
+        frame: of the poses, of one map or of many.
         metric: whether one unit of the map's world is a metre.
         options: those that the images are matched with.
         max_gap_s: longest time between measured instants across which gaps are filled; 0: none.
@@ -103,7 +104,7 @@ class SequenceSolver:
 
     def __init__(
         self,
-        geometry: MapGeometry,
+        frame: Frame,
         *,
         metric: bool,
         options: LocalizeOptions,
@@ -111,7 +112,7 @@ class SequenceSolver:
         max_gap_s: float,
     ) -> None:
         check_max_gap(max_gap_s)
-        self._geometry = geometry
+        self._frame = frame
         self._metric = metric
         self._options = options
         self._tick_s = time_unit.seconds
@@ -122,46 +123,21 @@ class SequenceSolver:
         self._entries: list[_Entry] = []  # answered ones that still help, then those that wait
         self._num_answered = 0
         self._readings = ALL_READINGS  # of the odometry, that fit the photos so far
-        self._cameras = NO_CAMERAS
+        self.cameras = NO_CAMERAS  # what the instants so far say of theirs
         self._rest = 0  # instants to come before a window without any pose is searched again
 
-    @property
-    def newest(self) -> RigPose | None:
-        """The pose of the newest instant from its own images; None when they do not localize it."""
-        return self._entries[-1].solved.answer.pose if self._entries else None
-
-    def add(self, seen: SeenInstant) -> list[InstantAnswer]:
-        """Take one more instant; return the answers that are final now.
+    def take(self, seen: SeenInstant, solved: Solved) -> list[InstantAnswer]:
+        """Take one more instant, solved in the frame; return the answers that are final now.
 
         Raises:
-            InvalidInput: as ``solve``.
-        """
-        return self.take(seen, self.solve(seen))
-
-    def solve(self, seen: SeenInstant) -> Solved:
-        """Solve an instant on its own, before ``min_probability`` counts, so that maps compare.
-
-        Raises:
-            InvalidInput: ``sequence.odometry`` for a map that is not metric; ``priors.*`` that
-                mean nothing in the map.
+            InvalidInput: ``sequence.odometry`` for a frame that is not metric.
         """
         check_odometry(seen.odometry, metric=self._metric)
-        return solve_instant(
-            seen.images,
-            self._geometry,
-            self._options.before_rivals(),
-            seen.priors,
-            seen.timestamp,
-            cameras=self._cameras,
-        )
-
-    def take(self, seen: SeenInstant, solved: Solved) -> list[InstantAnswer]:
-        """Take one more instant that was solved; return the answers that are final now."""
         refusal = not_probable_enough(solved.answer, self._options)
         if refusal is not None:
             solved = solved.refused(refusal)
         if solved.pose is not None:
-            self._cameras = solved.cameras
+            self.cameras = solved.cameras
         if self._first_timestamp is None:
             self._first_timestamp = seen.timestamp
         ticks = seen.timestamp - self._first_timestamp
@@ -280,7 +256,7 @@ class SequenceSolver:
                 self._with_pose(
                     replace(alone, images=with_inliers(alone.images, pose.inliers)),
                     TracedPose(
-                        pose.rig_from_world, covariance, source, self._geometry.errors.uncertainty
+                        pose.rig_from_world, covariance, source, entry.solved.errors.uncertainty
                     ),
                     entry.seen.priors,
                     pose.photo_covariance,
@@ -308,8 +284,8 @@ class SequenceSolver:
         there = UncertainPose.from_additive(found.rig_from_world, found.covariance)
         if lead_elsewhere(self._readings, self._odometry(run), *ends, there.covariance):
             return "is not confirmed: the photos so far fit other conventions, too"
-        away = np.linalg.norm(self._geometry.centers - there.pose.center, axis=1).min()
-        if away > self._geometry.reach:
+        away = self._frame.leads_out(there.pose.center)
+        if away is not None:
             return f"leads out of the map, {away:.2f} from its nearest photo"
         return None
 
@@ -324,7 +300,7 @@ class SequenceSolver:
         return replace(alone, refusal=replace(alone.refusal, message=message))
 
     def _window_instant(self, solved: Solved) -> WindowInstant:
-        refusal, errors = solved.answer.refusal, self._geometry.errors
+        refusal, errors = solved.answer.refusal, solved.errors
         if refusal is not None and refusal.reason in _NO_EVIDENCE:
             # Matches under wrong priors could pass together the gate that refused each alone.
             # Matches that another map explains as well are no evidence for this one. Pixels of a
@@ -392,7 +368,7 @@ class SequenceSolver:
         """The pose of an answer, back in the map's own coordinates."""
         assert answer.pose is not None  # the caller has looked
         pose, covariance = with_origin(
-            answer.pose.rig_from_world, answer.pose.covariance, -self._geometry.origin
+            answer.pose.rig_from_world, answer.pose.covariance, -self._frame.origin
         )
         source, uncertainty = answer.pose.source, answer.pose.uncertainty
         return TracedPose(pose, covariance, source, uncertainty, answer.num_inliers)
@@ -412,17 +388,53 @@ class SequenceSolver:
             priors: of the instant.
             photo_covariance: (6, 6), if the instant's own images measured the pose.
         """
-        constraints = Constraints(self._geometry, priors)
+        constraints = PosePriors(self._frame, priors)
         contradiction = contradicts_priors(constraints, found.pose, found.covariance)
         if contradiction is not None:
             return replace(answer, pose=None, refusal=answer.refusal or contradiction)
         pose = rig_pose(
-            found.pose, found.covariance, self._geometry, found.source, photo_covariance
+            found.pose,
+            found.covariance,
+            self._frame.origin,
+            found.source,
+            found.uncertainty,
+            photo_covariance,
         )
         measured = found.source is PoseSource.ESTIMATED
         if measured and answer.pose is not None:  # the motion agrees with what the images showed
             pose = replace(pose, probability=answer.pose.probability)
         return replace(answer, pose=pose, refusal=None if measured else answer.refusal)
+
+
+class MapSequenceSolver(SequenceSolver):
+    """Also solves the instants, each on its own in one map, whose geometry is the frame."""
+
+    _frame: MapGeometry
+
+    def add(self, seen: SeenInstant) -> list[InstantAnswer]:
+        """Take one more instant; return the answers that are final now.
+
+        Raises:
+            InvalidInput: as ``solve``.
+        """
+        return self.take(seen, self.solve(seen))
+
+    def solve(self, seen: SeenInstant) -> Solved:
+        """Solve an instant on its own, before ``min_probability`` counts, so that maps compare.
+
+        Raises:
+            InvalidInput: ``sequence.odometry`` for a map that is not metric; ``priors.*`` that
+                mean nothing in the map.
+        """
+        check_odometry(seen.odometry, metric=self._metric)
+        return solve_instant(
+            seen.images,
+            self._frame,
+            self._options.before_rivals(),
+            seen.priors,
+            seen.timestamp,
+            cameras=self.cameras,
+        )
 
 
 def check_max_gap(max_gap_s: float) -> None:

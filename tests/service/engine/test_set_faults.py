@@ -24,8 +24,7 @@ from mapping.frames.georeference import given_place, publish_anchored
 from mapping.maps.sets import publish_set
 from service.engine.catalog import Catalog
 from service.engine.listing import Listing
-from service.engine.set_photos import Slots
-from service.engine.set_sequences import SetSequence
+from service.engine.set_sequences import SequenceInSet
 from service.values import Near as Circle
 from tests.service.map_sets import (
     SITE_FROM_ROOM,
@@ -147,7 +146,7 @@ def test_odometry_that_a_map_does_not_take_is_refused_before_any_work(
         assert told(client, sent, "room") == [("error", "sequence.odometry")]
 
 
-def test_an_instant_that_shows_nothing_stays_in_its_leg(
+def test_an_instant_that_shows_nothing_is_filled_in_the_tile_beside_it(
     site_copy: Path, serve: Serve, queries: list[Any]
 ) -> None:
     camera = queries[0].camera
@@ -168,7 +167,7 @@ def test_an_instant_that_shows_nothing_stays_in_its_leg(
             ]
 
 
-def test_a_tile_that_is_away_does_not_end_a_leg_elsewhere(
+def test_a_tile_that_is_away_does_not_end_a_sequence_elsewhere(
     site_copy: Path, serve: Serve, queries: list[Any], in_study: list[Any]
 ) -> None:
     (site_copy / "study").rename(site_copy / "away")
@@ -178,21 +177,21 @@ def test_a_tile_that_is_away_does_not_end_a_leg_elsewhere(
     assert found == [("localized", "room"), ("filled", "room"), ("localized", "room")]
 
 
-def test_answers_of_a_leg_outlive_an_error_of_the_next(
+def test_answers_outlive_an_error_of_a_later_instant(
     client: Client,
     query: Any,
     in_study: list[Any],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    begin, begun = SetSequence._begin, list[Any]()
+    search, searched = SequenceInSet._searched, list[Any]()
 
-    async def second_fails(self: SetSequence, pending: Any) -> Any:
-        begun.append(pending)
-        if len(begun) == 2:
+    async def fourth_fails(self: SequenceInSet, *asked: Any) -> Any:
+        searched.append(asked)
+        if len(searched) == 4:
             raise Unavailable("server.worker_died", "died")
-        return await begin(self, pending)
+        return await search(self, *asked)
 
-    monkeypatch.setattr(SetSequence, "_begin", second_fails)
+    monkeypatch.setattr(SequenceInSet, "_searched", fourth_fails)
     photos = [query.image, b"no photo", b"no photo", in_study[0][0]]
     found = told(client, instants(photos, query.camera), "site")
     assert [tile for _, tile in found[:3]] == ["room"] * 3
@@ -229,7 +228,7 @@ def test_a_tile_that_does_not_know_a_rig_leaves_it_to_others(client: Client, sam
     assert unknown.value.code == "rig.unknown"
 
 
-def test_a_tile_that_does_not_know_the_rig_ends_no_leg(
+def test_a_tile_that_does_not_know_the_rig_ends_no_sequence(
     client: Client, sample: Path, in_study: list[Any]
 ) -> None:
     dataset = read_dataset(sample / "query")
@@ -241,9 +240,7 @@ def test_a_tile_that_does_not_know_the_rig_ends_no_leg(
     assert [each.status for each in found] == ["localized", "filled", "localized"]
 
 
-def test_an_instant_may_name_tiles_while_a_leg_goes_on(
-    client: Client, query: Any, in_study: list[Any]
-) -> None:
+def test_an_instant_may_name_tiles(client: Client, query: Any, in_study: list[Any]) -> None:
     def sent(photo: bytes, *names: str) -> list[Instant]:
         plain = instants([query.image, photo, query.image], query.camera)
         return [plain[0], replace(plain[1], priors=Priors(maps=names)), plain[2]]
@@ -380,31 +377,6 @@ def test_a_tile_of_features_that_are_not_here_is_away(
     with pytest.raises(Unavailable) as away:
         client.localize(in_study[0][0], "site", in_study[0][1])
     assert (away.value.code, away.value.got) == ("set.tile_unavailable", "weights.missing")
-
-
-def test_rooms_for_photos_are_taken_by_photos() -> None:
-    async def in_turn() -> None:
-        slots = Slots(3)
-        assert await slots.take(2) == 2
-        rigs = [asyncio.create_task(slots.take(count)) for count in (16, 2, 2)]
-        await asyncio.sleep(0)
-        await asyncio.sleep(0)
-        assert (slots.waiting, [rig.done() for rig in rigs]) == (20, [False] * 3)
-        rigs[1].cancel()  # a caller that hangs up
-        slots.give_back(2)
-        assert await rigs[0] == 3
-        assert not rigs[2].done()
-        slots.give_back(3)
-        assert await rigs[2] == 2
-        # One that ends while it waits for the rest gives back what it has.
-        last = asyncio.create_task(slots.take(3))
-        await asyncio.sleep(0)
-        last.cancel()
-        slots.give_back(2)
-        assert await slots.take(3) == 3
-        assert slots.waiting == 0
-
-    asyncio.run(in_turn())
 
 
 def test_tiles_of_sets_are_not_read_to_find_what_is_near(site: Path) -> None:

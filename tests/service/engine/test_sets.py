@@ -313,7 +313,7 @@ def test_a_rig_in_one_of_two_tiles_that_look_alike_is_refused_with_both(
         assert place.orientation == pytest.approx(alone.pose.orientation, abs=1e-6)
 
 
-def test_a_sequence_goes_from_tile_to_tile_in_legs(
+def test_a_sequence_goes_from_tile_to_tile(
     client: Client, queries: list[Any], in_study: list[Any]
 ) -> None:
     here, there = [q.image for q in queries], [image for image, _, _ in in_study]
@@ -325,7 +325,7 @@ def test_a_sequence_goes_from_tile_to_tile_in_legs(
     assert tiles == ["room", "room", "study", "study", "study", "room"]
     assert [each.status for each in found[:3]] == ["localized"] * 3
     assert [each.pose.metric for each in found[:3]] == [True] * 3
-    assert found[3].status == "filled"  # by the two photos of the same leg around it
+    assert found[3].status == "filled"
     for each, (image, moved) in zip(
         found[:2], [(q, SITE_FROM_ROOM) for q in queries[:2]], strict=True
     ):
@@ -355,7 +355,9 @@ def test_a_sequence_is_refused_as_in_a_map(
     assert caught.value.code == "sequence.empty"
 
 
-def test_a_place_that_looks_like_another_begins_no_leg(client: Client, query: Any) -> None:
+def test_a_sequence_at_a_place_that_looks_like_another_has_no_pose(
+    client: Client, query: Any
+) -> None:
     sent = instants([query.image] * 2, query.camera)
     for each in client.localize_sequence(sent, "twice"):
         assert each.refusal is not None

@@ -18,7 +18,7 @@ from visloc.pose.motion import MapErrors
 from visloc.priors import NO_PRIORS, HeightBand, PositionPrior, Priors
 from visloc.sequences import solver as sequence_module
 from visloc.sequences.filling import MAX_GAP_S, Odometry, TimeUnit
-from visloc.sequences.solver import MAX_WAITING, SeenInstant, SequenceSolver
+from visloc.sequences.solver import MAX_WAITING, MapSequenceSolver, SeenInstant
 from visloc.types import CameraSource, InstantAnswer, PoseSource, Reason, Refusal
 
 OPTIONS = LocalizeOptions()
@@ -57,13 +57,13 @@ def odometry(step: float, jump: Pose | None = None, covariance: Any = None) -> O
 
 def solver(
     place: Any, max_gap_s: float, unit: TimeUnit = TimeUnit.MS, metric: bool = True
-) -> SequenceSolver:
-    return SequenceSolver(
+) -> MapSequenceSolver:
+    return MapSequenceSolver(
         place.geometry, metric=metric, options=OPTIONS, time_unit=unit, max_gap_s=max_gap_s
     )
 
 
-def answers_to(solving: SequenceSolver, instants: list[SeenInstant]) -> list[InstantAnswer]:
+def answers_to(solving: MapSequenceSolver, instants: list[SeenInstant]) -> list[InstantAnswer]:
     answers = [answer for instant in instants for answer in solving.add(instant)]
     return answers + solving.finish()
 
@@ -257,9 +257,7 @@ def test_whatever_the_pattern_every_instant_is_answered_once_in_order_and_in_tim
             # without odometry is not kept waiting by anything but its elders.
             due = sum(times[i] - time >= 1000 * max_gap_s for time in times[: i + 1])
             assert len(answers) >= due
-            newest_alone = solving.newest is not None
-            assert newest_alone == (steps[i][0] == "good")
-            if not any(moving for _, moving, _ in steps[: i + 1]) and newest_alone:
+            if not any(moving for _, moving, _ in steps[: i + 1]) and steps[i][0] == "good":
                 assert len(answers) == i + 1
         answers += solving.finish()
         assert solving.finish() == []
@@ -464,7 +462,7 @@ def test_photos_with_evidence_against_their_pose_do_not_pass_together(
 
 
 def test_instants_less_probable_than_asked_for_are_filled_by_those_that_are_not(here: Any) -> None:
-    solving = SequenceSolver(
+    solving = MapSequenceSolver(
         here.geometry,
         metric=True,
         options=replace(OPTIONS, min_probability=0.8),
@@ -498,7 +496,7 @@ def test_poses_that_only_the_window_measures_are_not_judged_and_pass_no_raised_g
     """Weak photos pass together; each alone has too few inliers to be judged."""
     weak = instants_of(here, "wwwww", moving=True)
     found = answers_to(solver(here, 1.0), weak)
-    raised = SequenceSolver(
+    raised = MapSequenceSolver(
         here.geometry,
         metric=True,
         options=replace(OPTIONS, min_probability=0.8),
@@ -914,8 +912,8 @@ def test_photos_of_a_camera_together_correct_what_none_of_them_tells_alone(place
     geometry = place.geometry
     geometry.errors = MapErrors(position_factor=4.0, orientation_factor=4.0)
 
-    def solving() -> SequenceSolver:
-        return SequenceSolver(
+    def solving() -> MapSequenceSolver:
+        return MapSequenceSolver(
             geometry, metric=True, options=OPTIONS, time_unit=TimeUnit.MS, max_gap_s=0.0
         )
 

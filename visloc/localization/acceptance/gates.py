@@ -18,7 +18,7 @@ from visloc.geometry import Camera, Pose
 from visloc.localization.acceptance.camera_check import camera_contradiction
 from visloc.localization.acceptance.evidence import SeenView, Shown, evidence_of
 from visloc.localization.acceptance.probability import against, shipped_model
-from visloc.localization.map_view.constraints import Constraints
+from visloc.localization.map_view.constraints import Constraints, PosePriors
 from visloc.options import (
     DEFAULT_PRESET,
     LEAST_PROBABILITY,
@@ -326,7 +326,7 @@ def not_better_elsewhere(elsewhere: Problem, pose: GeneralizedPose | None) -> Re
 
 
 def contradicts_priors(
-    constraints: Constraints, rig_from_world: Pose, covariance: NDArray[np.float64]
+    constraints: PosePriors, rig_from_world: Pose, covariance: NDArray[np.float64]
 ) -> Refusal | None:
     """Refuse a pose that contradicts the priors, both from the map's origin.
 

@@ -9,12 +9,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from visloc.archive import Manifest, Map
+from visloc.archive import Manifest, Map, SetWorld, World
 from visloc.archive.places import located
 from visloc.errors import refuse
 from visloc.features.resolution import Resolution, WorkingResolution
@@ -60,6 +61,27 @@ def _errors_of(manifest: Manifest) -> MapErrors:
     )
 
 
+class Frame(Protocol):
+    """What poses and priors refer to: the world of a map, or of many."""
+
+    @property
+    def world(self) -> World | SetWorld: ...
+
+    @property
+    def origin(self) -> NDArray[np.float64]:
+        """(3,) where the frame's own coordinates begin, in its world."""
+
+    @property
+    def down(self) -> NDArray[np.float64] | None:
+        """(3,) unit vector; None when unknown."""
+
+    def leads_out(self, center: NDArray[np.float64]) -> float | None:
+        """Return how far a centre (3,) is from the nearest photo, if that is out of its sight.
+
+        ``center`` is relative to the origin; None within sight.
+        """
+
+
 class MapGeometry:
     """Where a map's photos were taken and how far they see; in the map's own coordinates.
 
@@ -80,6 +102,15 @@ class MapGeometry:
     def ref(self) -> str:
         """The map, ``id@version``."""
         return self.opened.ref
+
+    @property
+    def world(self) -> World:
+        return self.opened.manifest.world
+
+    def leads_out(self, center: NDArray[np.float64]) -> float | None:
+        """Return how far a centre (3,) is from the nearest photo; None within its sight."""
+        away = float(np.linalg.norm(self.centers - center, axis=1).min())
+        return away if away > self.reach else None
 
     def photo_name(self, row: int) -> str:
         """Return the name of a photo of the map."""
@@ -162,11 +193,11 @@ class MapGeometry:
         return float(np.median(distances)) if distances else 0.0
 
 
-class Constraints:
-    """The priors of one query in one map.
+class PosePriors:
+    """The priors of one query in one frame: whether a pose obeys them.
 
     Args:
-        geometry: of the map.
+        frame: the frame.
         priors: as they were sent, in the world.
 
     Raises:
@@ -175,13 +206,13 @@ class Constraints:
             it lies on Earth.
     """
 
-    def __init__(self, geometry: MapGeometry, priors: Priors) -> None:
-        self.geometry = geometry
+    def __init__(self, frame: Frame, priors: Priors) -> None:
+        self._origin = frame.origin
         if priors.gnss is not None:
-            priors = located(priors, geometry.opened.manifest.world)
+            priors = located(priors, frame.world)
         self._priors = priors
         gravity = priors.gravity
-        down = geometry.down
+        down = frame.down
         if gravity is not None and gravity.world is not None:
             if down is not None and gravity.world @ down < math.cos(_MAX_DOWN_DIFFERENCE):
                 raise refuse(
@@ -211,46 +242,8 @@ class Constraints:
         self._pose = None
         if priors.pose is not None:
             self._pose = with_origin(
-                priors.pose.device_from_world, priors.pose.covariance, -geometry.origin
+                priors.pose.device_from_world, priors.pose.covariance, -frame.origin
             )
-
-    @property
-    def errors(self) -> MapErrors:
-        """The map's own errors, which widen every covariance."""
-        return self.geometry.errors
-
-    @property
-    def narrow(self) -> bool:
-        """Whether the priors exclude photos or poses from the search."""
-        priors = self._priors
-        return any((priors.position, priors.height, priors.pose, priors.gravity, priors.gnss))
-
-    @cached_property
-    def photo_weights(self) -> NDArray[np.float64] | None:
-        """Return weights (n,) of the map's photos, 0 to 1; None when all count the same."""
-        spheres = []
-        if self._priors.position is not None:
-            prior = self._priors.position
-            spheres.append((prior.position - self.geometry.origin, prior.radius))
-        if self._pose is not None:
-            spheres.append((self._pose[0].center, POSE_PRIOR_STDS * largest_std(*self._pose)))
-        if not spheres and self._priors.height is None and self._priors.gnss is None:
-            return None
-        centers = self.geometry.centers
-        weights = np.ones(len(centers))
-        reach = max(self.geometry.reach, _LEAST_REACH)
-        for center, radius in spheres:
-            beyond = (np.linalg.norm(centers - center, axis=1) - radius) / reach
-            weights *= _weight(beyond)
-        fix = self._priors.gnss
-        if fix is not None:
-            weights *= _weight(fix.beyond(centers + self.geometry.origin) / (_metres(fix) * reach))
-        band = self._priors.height
-        if band is not None and self._up is not None:
-            slack = HEIGHT_REACH * (band.max - band.min)
-            heights = (centers + self.geometry.origin) @ self._up
-            weights[(heights < band.min - slack) | (heights > band.max + slack)] = 0.0
-        return weights
 
     def contradiction(self, pose: Pose, covariance: NDArray[np.float64]) -> str | None:
         """Say which prior a pose contradicts, and by how much; None when it obeys all.
@@ -260,7 +253,7 @@ class Constraints:
             covariance: (6, 6) of it, the errors of the map included.
         """
         own = _OWN_STDS * largest_std(pose, covariance)
-        center = pose.center + self.geometry.origin
+        center = pose.center + self._origin
         position = self._priors.position
         if position is not None:
             away = float(np.linalg.norm(center - position.position))
@@ -332,6 +325,55 @@ class Constraints:
             near = angle <= turn + slack + np.arctan2(move, depth)
             kept.append(replace(view, pixels=view.pixels[near], points=view.points[near]))
         return kept
+
+
+class Constraints(PosePriors):
+    """The priors of one query in one map.
+
+    Args and errors are those of ``PosePriors``.
+    """
+
+    def __init__(self, geometry: MapGeometry, priors: Priors) -> None:
+        super().__init__(geometry, priors)
+        self.geometry = geometry
+
+    @property
+    def errors(self) -> MapErrors:
+        """The map's own errors, which widen every covariance."""
+        return self.geometry.errors
+
+    @property
+    def narrow(self) -> bool:
+        """Whether the priors exclude photos or poses from the search."""
+        priors = self._priors
+        return any((priors.position, priors.height, priors.pose, priors.gravity, priors.gnss))
+
+    @cached_property
+    def photo_weights(self) -> NDArray[np.float64] | None:
+        """Return weights (n,) of the map's photos, 0 to 1; None when all count the same."""
+        spheres = []
+        if self._priors.position is not None:
+            prior = self._priors.position
+            spheres.append((prior.position - self.geometry.origin, prior.radius))
+        if self._pose is not None:
+            spheres.append((self._pose[0].center, POSE_PRIOR_STDS * largest_std(*self._pose)))
+        if not spheres and self._priors.height is None and self._priors.gnss is None:
+            return None
+        centers = self.geometry.centers
+        weights = np.ones(len(centers))
+        reach = max(self.geometry.reach, _LEAST_REACH)
+        for center, radius in spheres:
+            beyond = (np.linalg.norm(centers - center, axis=1) - radius) / reach
+            weights *= _weight(beyond)
+        fix = self._priors.gnss
+        if fix is not None:
+            weights *= _weight(fix.beyond(centers + self.geometry.origin) / (_metres(fix) * reach))
+        band = self._priors.height
+        if band is not None and self._up is not None:
+            slack = HEIGHT_REACH * (band.max - band.min)
+            heights = (centers + self.geometry.origin) @ self._up
+            weights[(heights < band.min - slack) | (heights > band.max + slack)] = 0.0
+        return weights
 
 
 def _weight(beyond: NDArray[np.float64]) -> NDArray[np.float64]:
