@@ -355,9 +355,7 @@ def test_a_sequence_is_refused_as_in_a_map(
     assert caught.value.code == "sequence.empty"
 
 
-def test_a_sequence_at_a_place_that_looks_like_another_has_no_pose(
-    client: Client, query: Any
-) -> None:
+def test_a_sequence_at_places_that_look_alike_has_no_pose(client: Client, query: Any) -> None:
     sent = instants([query.image] * 2, query.camera)
     for each in client.localize_sequence(sent, "twice"):
         assert each.refusal is not None
