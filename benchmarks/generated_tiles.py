@@ -29,10 +29,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.maps.coarse_model import random_rotation
 from visloc.features.descriptors.whitening import unit_rows
 from visloc.retrieval.inverted import MadeLists
-from visloc.sets.coarse import CoarseModel, described
+from visloc_extensions.sets.coarse import CoarseModel, described
+from visloc_extensions.sets.coarse_model import random_rotation
 
 SIMILARITIES = Path(__file__).parent / "tile_similarities.json"
 # Of the quantiles in that file, and what is compared (docs/scale.md).

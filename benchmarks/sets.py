@@ -22,7 +22,6 @@ import numpy as np
 import typer
 
 from benchmarks.engines import engine_of
-from mapping.maps.sets import publish_set
 from service.engine.engine import Engine
 from service.values import Localization, RigJob, photo_job
 from visloc.archive import MapStore
@@ -30,6 +29,7 @@ from visloc.geometry import Similarity
 from visloc.kapture import read_dataset
 from visloc.options import LocalizeOptions
 from visloc.types import Reason
+from visloc_extensions.sets.publishing import publish_set
 
 APART_M = 10_000.0
 OPTIONS = LocalizeOptions()

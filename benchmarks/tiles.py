@@ -37,18 +37,11 @@ from benchmarks.generated_tiles import (
     generated_model,
     similarities,
 )
-from visloc.archive import (
-    FingerprintRecord,
-    SetContent,
-    SetWorld,
-    SimilarityRecord,
-    TileRecord,
-    write_set,
-)
+from visloc.archive import FingerprintRecord, SetWorld, SimilarityRecord, TileRecord
 from visloc.archive.schema import Extent
-from visloc.archive.sets import joined_extent
 from visloc.retrieval.inverted import MadeLists
-from visloc.sets.coarse import TILE_LISTS, CoarseModel, coarse_index, described
+from visloc_extensions.sets.coarse import TILE_LISTS, CoarseModel, coarse_index, described
+from visloc_extensions.sets.files import SetContent, joined_extent, write_set
 
 TILE_M = 25.0
 # How far its photos see: a street, or a large room.

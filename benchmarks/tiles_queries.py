@@ -15,12 +15,12 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from visloc.archive import MapSet, open_set
 from visloc.features.descriptors.whitening import unit_rows
 from visloc.priors import PositionPrior, Priors
-from visloc.sets.choosing import MAX_SEARCHED, allowed_tiles, plan
-from visloc.sets.coarse import rank_tiles, ranked
 from visloc.types import LocalFeatures
+from visloc_extensions.sets.choosing import MAX_SEARCHED, allowed_tiles, plan
+from visloc_extensions.sets.coarse import rank_tiles, ranked
+from visloc_extensions.sets.files import MapSet, open_set
 
 RADIUS_M = 30.0
 # Features of a query of default options.

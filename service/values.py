@@ -18,7 +18,6 @@ from visloc.localization.acceptance.judge import PlaceAnswer
 from visloc.options import Inference, LocalizeOptions
 from visloc.priors import NO_PRIORS, Priors
 from visloc.sequences.filling import Odometry, TimeUnit
-from visloc.sets.choosing import TileScore
 from visloc.types import (
     InstantAnswer,
     MaskedImage,
@@ -262,19 +261,6 @@ class OpenMap(NamedTuple):
 
     ref: str
     size: int
-
-
-class RankedTiles(NamedTuple):
-    """The tiles of a set ranked by a photo.
-
-    Attributes:
-        query: packed where it could be decoded, else as it came.
-        scores: of the most similar tiles, best first; empty when none were to be ranked, or the
-            photo shows nothing.
-    """
-
-    query: Query
-    scores: tuple[TileScore, ...] = ()
 
 
 # Matches of an image with each map. Pickled, because only worker processes read it.

@@ -22,6 +22,9 @@ RECOGNIZERS = "visloc.recognizers"
 EXECUTORS = "visloc.executors"
 # (URL, folder of copies, bytes of copies) -> visloc.archive.MapStore; the name is "url".
 MAP_STORES = "visloc.map_stores"
+# What opens and searches the ids of sets of maps (visloc_extensions.sets.kind.SetKind); the name
+# is the format that their manifest states.
+MAP_KINDS = "visloc.map_kinds"
 # (app) -> None: adds routes to the ASGI app of the service.
 HTTP_ROUTES = "visloc.http_routes"
 

@@ -70,7 +70,7 @@ class HeightBand:
         min: in units of the world.
         max: greater than ``min``.
         down: unit vector along which they are measured; None for what the map knows of down, or
-            the gravity prior. In a tile it is that of the set (``visloc.sets.frame``).
+            the gravity prior. In a tile it is that of the set.
     """
 
     min: float

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from mapping.maps.sets import publish_set
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.pipeline.build import build_map
 from mapping.pipeline.settings import BuildSettings
@@ -19,6 +18,7 @@ from mapping.sample import write_sample
 from visloc.archive import MapStore
 from visloc.geometry import PixelOrigin, Similarity
 from visloc.kapture import Dataset, FileRecord, read_dataset, write_dataset
+from visloc_extensions.sets.publishing import publish_set
 
 SAMPLE, FLOORS = "sample", "floors"
 # The videos of floors 10 and 13 by the map that half of their photos make.

@@ -18,7 +18,6 @@ from mapping.cli.datasets import (
 from mapping.cli.display import ERR
 from mapping.cli.from_settings import from_settings
 from mapping.cli.maps import anchor, edit, export, inspect, pack, upgrade, verify
-from mapping.cli.sets import set_maps, split
 from visloc.errors import VislocError
 from visloc.extensions import MAPPING_COMMANDS, extensions, load
 
@@ -34,8 +33,6 @@ COMMANDS: Mapping[str, Callable[..., None]] = {
     "inspect": inspect,
     "verify": verify,
     "use": use,
-    "set": set_maps,
-    "split": split,
     "sample": sample,
 }
 

@@ -16,7 +16,6 @@ import typer
 from mapping.cli.acceptance import require_acceptance
 from mapping.cli.display import ERR, print_georeference, print_map, say, say_notes, summary_of
 from mapping.cli.progress import StageProgress
-from mapping.cli.sets import print_set, set_summary, verify_tiles
 from mapping.cluster.storage import is_map_folder, map_folder
 from mapping.frames.georeference import (
     Georeference,
@@ -35,8 +34,9 @@ from mapping.maps.upgrading import lacking, upgrade_map
 from mapping.options import AcceptOption, Gravity, MapArgument, MapsDirOption, WeightsDirOption
 from mapping.progress import one_step
 from mapping.stages.imported_points import read_imported_points
-from visloc.archive import Anchor, Map, SetManifest, open_map, open_set, verify_map, verify_set
+from visloc.archive import Anchor, Map, SetManifest, open_map, verify_map
 from visloc.archive.checks import read_any_manifest
+from visloc.archive.kinds import kind_of_sets
 from visloc.errors import refuse
 from visloc.features import make_global_descriptor, make_local_features
 from visloc.features.local.readymade import is_ready_made
@@ -256,8 +256,7 @@ def inspect(
     """Show the contents of a map or a set."""
     folder = map_folder(map_ref, maps_dir)
     if isinstance(read_any_manifest(folder), SetManifest):
-        tiles = open_set(folder)
-        summary, show = set_summary(tiles), partial(print_set, tiles)
+        summary, show = kind_of_sets(map_ref).shown(folder)
     else:
         opened = open_map(folder)
         summary, show = summary_of(opened), partial(print_map, opened)
@@ -278,7 +277,7 @@ def verify(
     """
     folder = map_folder(map_ref, maps_dir)
     if isinstance(read_any_manifest(folder), SetManifest):
-        verify_tiles(verify_set(folder), None if is_map_folder(map_ref) else maps_dir)
+        kind_of_sets(map_ref).check(folder, None if is_map_folder(map_ref) else maps_dir)
         return
     with _step("verify", if_stopped="nothing was changed"):
         opened = verify_map(folder)

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from service.engine.catalog import Catalog
 from service.engine.instant_tasks import localize_in
 from service.engine.scenes import Scenes
+from service.engine.searches import SetSearches, answers_of, parted
 from service.engine.sequences import SequenceInMaps, SequenceSearch, answers_in_order
-from service.engine.set_sequences import SequenceInSet
-from service.engine.sets import SetSearch, answers_of, parted
 from service.engine.uploads import Uploads
 from service.errors import stopping_error
 from service.telemetry.metrics import Metrics
@@ -93,7 +92,7 @@ class Engine:
         )
         self._catalog = Catalog(store, self.workers)
         self.scenes = Scenes(self._catalog)
-        self._sets = SetSearch(self._catalog, self.workers, metrics)
+        self._sets = SetSearches(self._catalog, self.workers, metrics)
         self._max_loaded_bytes = settings.max_loaded_bytes
         self._limit_s = limit_s
         self._max_photos = workers + max_queue
@@ -236,7 +235,7 @@ class Engine:
     async def _search_once(self, job: RigJob) -> Localization:
         async with self._catalog.using(job.maps) as maps:
             sets, alone = parted(maps, job.priors)
-            searches = [self._sets.localize(job, each) for each in sets]
+            searches = [self._sets.of(each).localize(job, each) for each in sets]
             if alone:
                 searches.append(localize_in(self.workers, job, alone))
             with using_turn(Turn()):
@@ -269,7 +268,7 @@ class Engine:
                     got=", ".join(each.ref for each in maps),
                 )
             if sets:
-                search: SequenceSearch = SequenceInSet(self._sets, self.workers, start, sets[0])
+                search: SequenceSearch = self._sets.of(sets[0]).sequence(start, sets[0])
             else:
                 search = SequenceInMaps(self.workers, start, alone)
             async with aclosing(answers_in_order(search, instants)) as answers:

@@ -8,10 +8,10 @@ from contextlib import suppress
 
 from service.values import ServedMap
 from visloc.archive import MapOutline, MapStore, SetOutline
+from visloc.archive.set_outline import tiles_near
 from visloc.errors import MapCorrupt, NotFound, VislocError, refuse
 from visloc.options import MAX_MAPS
 from visloc.priors import MAX_TILES
-from visloc.sets.choosing import tiles_near
 from visloc.types import Near
 
 logger = logging.getLogger(__name__)

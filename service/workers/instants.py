@@ -11,7 +11,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from service.values import ONLY_SENSOR, ImageJob, Localization, PackedQuery, Query, Rig, RigJob
+from service.values import (
+    ONLY_SENSOR,
+    ImageJob,
+    Localization,
+    PackedQuery,
+    Query,
+    Rig,
+    RigJob,
+    WorkerSettings,
+)
 from visloc.archive import Map
 from visloc.archive.places import anchor_rms
 from visloc.errors import InvalidInput, refuse
@@ -235,6 +244,24 @@ class DecodedQuery:
     query: Photo | QueryFeatures
     found: FeatureCache
     seconds: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tools:
+    """What a worker process lends to the tasks of extensions.
+
+    Attributes:
+        decode: ``decode`` with the limits of the process.
+        step: stops the task when nobody waits any more.
+        began: ``time.time`` at which the task began.
+        open_s: seconds that opening the set took.
+    """
+
+    settings: WorkerSettings
+    decode: Callable[[Query], DecodedQuery]
+    step: Callable[[], None]
+    began: float
+    open_s: float
 
 
 def decode(query: Query, limits: ImageLimits, extractor_of: ExtractorOf) -> DecodedQuery:

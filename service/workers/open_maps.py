@@ -8,10 +8,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from time import perf_counter
+from typing import Protocol
 
 from service.values import Abandoned, MapFolder, OpenMap, Signals, WorkerSettings
-from service.workers.tiles import TileRanker, resolution_beside
-from visloc.archive.store import open_published, open_published_set
+from visloc.archive.kinds import kind_of_sets
+from visloc.archive.store import open_published
 from visloc.errors import Conflict, InvalidInput, VislocError, refuse
 from visloc.features import (
     GlobalDescriptor,
@@ -26,6 +27,15 @@ from visloc.localization.localizer import Localizer
 logger = logging.getLogger(__name__)
 
 
+class OpenSet(Protocol):
+    """What an extension opens under a map id; its other methods are tasks (``Vision.in_set``)."""
+
+    @property
+    def size_bytes(self) -> int: ...
+
+    def warm_up(self) -> None: ...
+
+
 class OpenMaps:
     """Opens maps and sets when they are asked for, and closes the least recently used ones."""
 
@@ -33,7 +43,7 @@ class OpenMaps:
         self._settings = settings
         self._signals = signals
         # The most recently used last.
-        self._opened: OrderedDict[str, Localizer | TileRanker] = OrderedDict()
+        self._opened: OrderedDict[str, Localizer | OpenSet] = OrderedDict()
         # By name, shared by all maps.
         self._extractors: dict[str, LocalFeatureExtractor] = {}
         self._descriptors: dict[str, GlobalDescriptor] = {}
@@ -48,13 +58,13 @@ class OpenMaps:
         assert isinstance(found, Localizer)  # a set has no localizer
         return found
 
-    def ranker(self, version: MapFolder) -> TileRanker:
-        """Return the ranker of a set's tiles; errors as in ``open``."""
+    def opened_set(self, version: MapFolder) -> OpenSet:
+        """Return an open set; errors as in ``open``."""
         found = self.open(version)
-        assert isinstance(found, TileRanker)
+        assert not isinstance(found, Localizer)
         return found
 
-    def open(self, version: MapFolder) -> Localizer | TileRanker:
+    def open(self, version: MapFolder) -> Localizer | OpenSet:
         """Open a map or a set, unless it is open, and warm it up.
 
         Raises:
@@ -95,7 +105,7 @@ class OpenMaps:
     def _size(self) -> int:
         return sum(map(_size_of, self._opened.values()))
 
-    def _open(self, version: MapFolder) -> Localizer | TileRanker:
+    def _open(self, version: MapFolder) -> Localizer | OpenSet:
         if not version.folder.is_dir():  # by another replica, while a request here still used it
             raise refuse("map.version", "the version was removed", field="map", got=version.ref)
         start = perf_counter()
@@ -115,10 +125,9 @@ class OpenMaps:
         matcher = partial(make_lightglue, weights_dir=self._settings.weights_dir)
         return Localizer(opened, extractor, self._descriptor, matcher)
 
-    def _open_set(self, version: MapFolder) -> TileRanker:
-        opened = open_published_set(version.folder)
-        resolution = resolution_beside(opened, version.folder)
-        return TileRanker(opened, self.extractor, resolution)
+    def _open_set(self, version: MapFolder) -> OpenSet:
+        opened: OpenSet = kind_of_sets(version.ref).open(version.folder, self.extractor)
+        return opened
 
     def _descriptor(self, name: str) -> GlobalDescriptor:
         if name not in self._descriptors:
@@ -128,8 +137,8 @@ class OpenMaps:
         return self._descriptors[name]
 
 
-def _size_of(opened: Localizer | TileRanker) -> int:
-    return opened.size_bytes if isinstance(opened, TileRanker) else opened.map.size_bytes
+def _size_of(opened: Localizer | OpenSet) -> int:
+    return opened.map.size_bytes if isinstance(opened, Localizer) else opened.size_bytes
 
 
 @contextmanager

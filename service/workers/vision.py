@@ -8,9 +8,9 @@ import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from time import perf_counter, time
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from service.values import (
     Abandoned,
@@ -24,7 +24,6 @@ from service.values import (
     PackedSequence,
     PackedSolved,
     Query,
-    RankedTiles,
     Rig,
     RigJob,
     SequenceJob,
@@ -36,18 +35,17 @@ from service.workers.instants import (
     DecodedQuery,
     SolvedInMap,
     Target,
+    Tools,
     check_images,
     check_options,
     check_priors,
     decode,
-    pack,
     refused_before,
     rig_in_map,
 )
 from service.workers.judging import gated, judged
 from service.workers.open_maps import OpenMaps
 from service.workers.sequences import SequenceRun
-from service.workers.set_sequences import SetRun
 from service.workers.state import packed, unpacked
 from visloc.drawing.matches_picture import draw_overlay
 from visloc.errors import InvalidInput, VislocError
@@ -58,7 +56,7 @@ from visloc.options import LocalizeOptions
 from visloc.photos.reading import ImageLimits, Photo
 from visloc.priors import Priors
 from visloc.runtime.threads import summed, use_threads
-from visloc.types import InstantAnswer, Refusal
+from visloc.types import InstantAnswer
 
 logger = logging.getLogger(__name__)
 
@@ -281,78 +279,12 @@ class Vision:
         row, best, chosen = _judged(job, targets, solved)
         return looked[row], best, targets[row], chosen
 
-    def rank_tiles(
-        self,
-        query: Query,
-        map_set: MapFolder,
-        options: LocalizeOptions,
-        allowed: NDArray[np.bool_] | None,
-        submitted: float,
-        refused: Refusal | None = None,
-    ) -> RankedTiles:
-        """Decode a photo, find its features, and rank tiles of a set by them.
-
-        An unusable photo comes back as it is, and ranks no tile. The tiles to rank are ``allowed``
-        (T,); None ranks none. If the photo was ``refused`` as it was sent, they are ranked by other
-        turns of it, or not at all if no turn can help.
-        """
-        queued, started = max(0.0, time() - submitted), perf_counter()
-        self._step()
-        ranker = self._maps.ranker(map_set)
-        seconds = {"queued": queued, "open_map": perf_counter() - started}
-        try:
-            decoded = self._decode(query)
-        except InvalidInput:
-            return RankedTiles(query)  # the tile that is searched reports the error
-        decoded = replace(decoded, seconds=summed(seconds, decoded.seconds))
-        if refused is None:
-            scores = ranker.rank(decoded, options, allowed)
-        elif is_worth_turning(refused.reason, options):
-            scores = ranker.rank_turned(decoded, options, allowed, self._step)
-        else:
-            scores = ()
-        return RankedTiles(pack(query, decoded), scores)
-
-    def open_in_set(self, start: SequenceJob, map_set: MapFolder) -> PackedSequence:
-        """Begin a sequence in a set."""
-        opened = self._maps.ranker(map_set)
-        return packed(SetRun(start, opened.outline, opened.frame), opened.kept)
-
-    def check_in_set(
-        self,
-        sequence: PackedSequence,
-        map_set: MapFolder,
-        first: int,
-        instants: Sequence[InstantJob],
-    ) -> tuple[PackedSequence, list[Priors], bytes]:
-        """Refuse instants as ``check_instants`` does; also return what is known of the cameras."""
-        kept = self._maps.ranker(map_set).kept
-        run: SetRun = unpacked(sequence, kept)
-        most = self._settings.max_instants
-        priors = [run.check(first + i, instant, most) for i, instant in enumerate(instants)]
-        return packed(run, kept), priors, run.cameras
-
-    def add_in_set(
-        self,
-        sequence: PackedSequence,
-        map_set: MapFolder,
-        instant: InstantJob,
-        row: int,
-        found: Localization,
-        solved: PackedSolved,
-        priors: Priors,
-    ) -> tuple[PackedSequence, list[Localization]]:
-        """Take the next instant of a sequence, which the tile of this row solved."""
-        self._step()
-        kept = self._maps.ranker(map_set).kept
-        run: SetRun = unpacked(sequence, kept)
-        answers = run.add(instant, row, found, solved, priors)
-        return packed(run, kept), answers
-
-    def finish_in_set(self, sequence: PackedSequence, map_set: MapFolder) -> list[Localization]:
-        """Return the answers that are still waiting, when no more instants come."""
-        run: SetRun = unpacked(sequence, self._maps.ranker(map_set).kept)
-        return run.finish()
+    def in_set(self, map_set: MapFolder, task: str, *args: Any) -> Any:
+        """Do a task of an open set: the method of this name, given the tools of this process."""
+        began = time()
+        opened = self._maps.opened_set(map_set)
+        tools = Tools(self._settings, self._decode, self._step, began, time() - began)
+        return getattr(opened, task)(tools, *args)
 
     def open_sequence(self, start: SequenceJob, maps: Sequence[MapFolder]) -> PackedSequence:
         settings = self._settings

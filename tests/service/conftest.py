@@ -108,7 +108,7 @@ def anchored_maps(built_maps: Path, tmp_path_factory: pytest.TempPathFactory) ->
 @pytest.fixture(scope="session")
 def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dataset of another room than the sample's."""
-    from tests.service.map_sets import write_study
+    from tests.service.rooms import write_study
 
     folder = tmp_path_factory.mktemp("study")
     write_study(folder)
@@ -116,34 +116,28 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def site(built_maps: Path, study: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Maps ``room``, ``study`` and ``copy``, and sets of them; only to be read."""
-    from tests.service.map_sets import write_site
+def two_rooms(built_maps: Path, study: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Maps ``room`` and ``study``; only to be read."""
+    from tests.service.rooms import add_study
 
-    maps = Path(shutil.copytree(built_maps, tmp_path_factory.mktemp("site") / "maps"))
-    write_site(study, maps)
+    maps = Path(shutil.copytree(built_maps, tmp_path_factory.mktemp("two_rooms") / "maps"))
+    add_study(study, maps)
     return maps
 
 
 @pytest.fixture(scope="session")
-def upright_site(sample: Path, study: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """``room``, ``study`` and their set, with features that do not know a turned photo."""
-    from tests.service.map_sets import write_upright_site
+def upright_room(sample: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """``room``, with features that do not know a turned photo."""
+    from tests.service.rooms import build_upright
 
-    maps = tmp_path_factory.mktemp("upright_site")
-    write_upright_site(sample, study, maps)
+    maps = tmp_path_factory.mktemp("upright_room")
+    build_upright(sample, "room", maps)
     return maps
-
-
-@pytest.fixture
-def site_copy(site: Path, tmp_path: Path) -> Path:
-    """The same, to be changed."""
-    return Path(shutil.copytree(site, tmp_path / "maps"))
 
 
 @pytest.fixture(scope="session")
 def in_study(study: Path) -> list[Any]:
     """Photos of the other room with their cameras and poses."""
-    from tests.service.map_sets import photos_of
+    from tests.service.rooms import photos_of
 
     return photos_of(study)

@@ -1,4 +1,4 @@
-"""Coarse poses over both doors and in sets, and what becomes of them in a batch."""
+"""Coarse poses over both doors, and what becomes of them in a batch."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from clients.wire.rigs import RigImage
 from visloc.errors import InvalidInput
 from visloc.geometry import Pose, center_covariance
 from visloc.types import RigSensor
-from visloc_api.words.priors import Priors
 
 # No pose has so many inliers.
 REFUSED = {"min_inliers": 1_000_000, "read_as": "upright", "fallback": "coarse"}
@@ -25,8 +24,8 @@ NOT_COMPARED = ("seconds", "request_id")
 
 
 @pytest.fixture(scope="module")
-def served(site: Path, serve: Any) -> Iterator[Any]:
-    with serve(site) as doors:
+def served(two_rooms: Path, serve: Any) -> Iterator[Any]:
+    with serve(two_rooms) as doors:
         yield doors
 
 
@@ -62,20 +61,10 @@ def test_a_localized_photo_has_none(served: Any, query: Any) -> None:
 
 
 def test_places_that_retrieval_cannot_tell_apart_give_none(served: Any, query: Any) -> None:
-    one_tile = Priors.model_validate({"maps": ["room"]})
     with Client(served.url) as client:
-        for asked in ("site", ["room", "study"]):
-            result = client.localize(query.image, asked, query.camera, REFUSED)
-            assert result.status == "not_localized"
-            assert result.coarse is None
-        alone = client.localize(query.image, "room", query.camera, REFUSED)
-        tile = client.localize(query.image, "model", query.camera, REFUSED, priors=one_tile)
-    assert alone.coarse is not None
-    assert tile.status == "coarse"
-    assert tile.coarse is not None
-    # The set "model" has another unit than its tile.
-    scale = np.linalg.norm(tile.coarse.position_std) / np.linalg.norm(alone.coarse.position_std)
-    assert scale != pytest.approx(1.0, abs=0.01)
+        result = client.localize(query.image, ["room", "study"], query.camera, REFUSED)
+    assert result.status == "not_localized"
+    assert result.coarse is None
 
 
 def test_rigs_and_sequences_have_none(served: Any, query: Any) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from visloc.archive.anchoring import write_anchored
 from visloc.archive.checks import sha256_of
 from visloc.archive.content import GlobalFeatures, Landmarks, MapContent, pose_row
+from visloc.archive.kinds import verify_any
 from visloc.archive.parts import add_own_test, write_tested
 from visloc.archive.places import GeoCircle, circle_of, down_of
 from visloc.archive.reader import Map, MapOutline, open_map, verify_map
@@ -17,25 +18,13 @@ from visloc.archive.schema import (
     OwnTest,
     World,
 )
+from visloc.archive.set_outline import SetOutline, read_any_outline, read_set_outline
 from visloc.archive.set_schema import SetManifest, SetWorld, SimilarityRecord, TileRecord
-from visloc.archive.sets import (
-    CoarseIndex,
-    MapSet,
-    SetContent,
-    SetOutline,
-    open_set,
-    read_any_outline,
-    read_set_outline,
-    verify_any,
-    verify_set,
-    write_set,
-)
 from visloc.archive.store import MapStore, open_remote_store
 from visloc.archive.writer import write_map
 
 __all__ = [
     "Anchor",
-    "CoarseIndex",
     "FingerprintRecord",
     "GeoCircle",
     "Geodetic",
@@ -46,10 +35,8 @@ __all__ = [
     "Map",
     "MapContent",
     "MapOutline",
-    "MapSet",
     "MapStore",
     "OwnTest",
-    "SetContent",
     "SetManifest",
     "SetOutline",
     "SetWorld",
@@ -61,16 +48,13 @@ __all__ = [
     "down_of",
     "open_map",
     "open_remote_store",
-    "open_set",
     "pose_row",
     "read_any_outline",
     "read_set_outline",
     "sha256_of",
     "verify_any",
     "verify_map",
-    "verify_set",
     "write_anchored",
     "write_map",
-    "write_set",
     "write_tested",
 ]

@@ -27,7 +27,7 @@ from visloc.archive.checks import MAX_MANIFEST_BYTES, check_files, read_any_mani
 from visloc.archive.npz import zip_errors
 from visloc.archive.schema import FILE_NAME
 from visloc.archive.set_rules import AnyManifest
-from visloc.archive.sets import SET_OFFSETS
+from visloc.archive.set_schema import SET_OFFSETS
 from visloc.errors import VislocError, refuse
 
 MAX_ENTRIES = 100_000

@@ -24,6 +24,8 @@ from visloc.priors import MAX_TILES
 
 SET_FORMAT = "visloc-set"
 SET_MAJOR, SET_MINOR = 2, 1
+# Sets of all formats have this file, and maps have not.
+SET_OFFSETS = "coarse/offsets.npy"
 # Scale of a tile. Beyond these, squares and inverses overflow.
 MIN_SCALE, MAX_SCALE = 1e-9, 1e9
 

@@ -11,8 +11,10 @@ from pathlib import Path
 
 from visloc.archive.backends.base import CURRENT, MANIFEST, Backend
 from visloc.archive.backends.folder import FolderBackend
+from visloc.archive.kinds import verify_any
 from visloc.archive.reader import Map, MapOutline, open_map
 from visloc.archive.schema import ID_PATTERN, Manifest
+from visloc.archive.set_outline import SetOutline
 from visloc.archive.set_rules import (
     AnyManifest,
     refuse_if_tile,
@@ -20,7 +22,7 @@ from visloc.archive.set_rules import (
     refuse_other_kind,
     unreadable_set,
 )
-from visloc.archive.sets import SET_OFFSETS, MapSet, SetOutline, open_set, verify_any
+from visloc.archive.set_schema import SET_OFFSETS
 from visloc.archive.version_rules import (
     checked_name,
     none_in_use,
@@ -114,10 +116,6 @@ class MapStore:
     def open(self, ref: str) -> Map:
         """Open ``id`` or ``id@version``; raises what ``folder`` and ``open_published`` raise."""
         return open_published(self.folder(ref))
-
-    def open_set(self, ref: str) -> MapSet:
-        """Open the set ``id`` or ``id@version``; raises what ``folder`` and ``open_set`` raise."""
-        return open_published_set(self.folder(ref))
 
     def outline(self, ref: str) -> MapOutline | SetOutline:
         """Describe ``id`` or ``id@version`` without opening its arrays; raises as ``open``."""
@@ -333,12 +331,5 @@ def open_published(folder: Path) -> Map:
         MapCorrupt: what ``open_map`` finds, or ``map.renamed`` if the folder has another name.
     """
     opened = open_map(folder)
-    refuse_renamed(opened.manifest, str(folder), folder.parent.name, folder.name)
-    return opened
-
-
-def open_published_set(folder: Path) -> MapSet:
-    """Open the set in a folder ``<id>/<version>``; raises as ``open_published``."""
-    opened = open_set(folder)
     refuse_renamed(opened.manifest, str(folder), folder.parent.name, folder.name)
     return opened

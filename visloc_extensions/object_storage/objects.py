@@ -22,11 +22,12 @@ from visloc.archive.checks import (
     parse_any_manifest,
     read_any_manifest,
 )
+from visloc.archive.kinds import verify_any
 from visloc.archive.reader import MapOutline
 from visloc.archive.schema import FILE_NAME
+from visloc.archive.set_outline import SetOutline, read_any_outline
 from visloc.archive.set_rules import AnyManifest
 from visloc.archive.set_schema import SetManifest
-from visloc.archive.sets import SetOutline, read_any_outline, verify_any
 from visloc.archive.version_rules import refuse_renamed
 from visloc.errors import Conflict, MapCorrupt, Unavailable, VislocError, refuse
 from visloc_extensions.object_storage.copies import Copies, size_of

@@ -13,7 +13,6 @@ import pytest
 
 from mapping.cli.acceptance import require_acceptance, use
 from mapping.maps.editing import content_of
-from mapping.maps.splitting import split_map
 from mapping.own_test.publishing import publish_edited
 from mapping.own_test.trials import OwnTestRun, run_own_test
 from mapping.own_test.verdict import doubts_about, misses_own_photos
@@ -244,22 +243,6 @@ def test_only_a_version_is_put_into_use(maps_dir: Path) -> None:
     assert caught.value.code == "map.use"
     with pytest.raises(NotFound):
         use("room@nothing", maps_dir)
-
-
-def test_nothing_is_made_of_a_version_in_doubt_until_it_is_accepted(
-    broken: Path, maps_dir: Path
-) -> None:
-    store = MapStore(maps_dir)
-    ref = f"room@{build(broken, maps_dir).manifest.version}"
-
-    with pytest.raises(Conflict) as caught:
-        split_map(store, ref, "tiles", lambda *_: None, tile=100.0, overlap=0.0)
-    assert caught.value.code == "map.doubtful"
-    assert store.ids() == ["room"]
-
-    use(ref, maps_dir)
-    split_map(store, ref, "tiles", lambda *_: None, tile=100.0, overlap=0.0)
-    assert "tiles" in store.ids()
 
 
 @pytest.mark.parametrize("poses", ["estimate", "given"])

@@ -13,16 +13,13 @@ from typer.testing import CliRunner
 
 from mapping.cli.main import app
 from mapping.maps.export import EXPORTERS, export_map
-from mapping.maps.sets import publish_set
-from mapping.maps.splitting import split_map
 from mapping.pipeline.build import build_map
 from mapping.pipeline.settings import BuildSettings
-from visloc.archive import Map, MapStore, open_set, verify_map
+from visloc.archive import Map, verify_map
 from visloc.drawing.detail_levels import detail_order, read_landmarks
 from visloc.drawing.point_bytes import HEADER_BYTES, read_points
 from visloc.errors import Conflict, InvalidInput
 from visloc.features import make_local_features
-from visloc.geometry import Similarity
 from visloc.kapture import read_dataset
 from visloc.localization.localizer import Localizer
 from visloc.localization.map_view.constraints import MapGeometry
@@ -42,11 +39,6 @@ def bare(
     """The walk as a map without landmarks; only to be read."""
     maps = tmp_path_factory.mktemp("bare")
     return build_walk(walk / "mapping", maps, method="retrieval-only", max_keypoints=1000)
-
-
-@pytest.fixture(scope="module")
-def store(bare: Map) -> MapStore:
-    return MapStore(bare.path.parents[1])
 
 
 def test_a_map_without_landmarks_keeps_all_that_was_found(bare: Map) -> None:
@@ -172,19 +164,6 @@ def test_exports_are_refused(bare: Map, tmp_path: Path, name: str) -> None:
     with pytest.raises(Conflict, match="has no landmarks"):
         export_map(bare, tmp_path / "out", name)
     assert not (tmp_path / "out").exists()
-
-
-def test_what_needs_landmarks_is_refused(bare: Map, store: MapStore) -> None:
-    with pytest.raises(Conflict) as caught:
-        split_map(store, bare.manifest.id, "tiles", quiet, tile=2.0, overlap=1.0)
-    assert caught.value.code == "map.no_landmarks"
-
-
-def test_a_set_takes_maps_without_landmarks(bare: Map, store: MapStore) -> None:
-    tiles = [(bare.manifest.id, Similarity.identity())]
-    opened = open_set(publish_set(store, "tiles", tiles, quiet))
-    assert opened.manifest.counts.landmarks == 0
-    assert opened.manifest.tiles[0].reach == pytest.approx(MapGeometry(bare).reach)
 
 
 def test_inspect_tells_that_there_are_no_landmarks(bare: Map) -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from clients import Client, Near, RigImage
 from mapping.frames.georeference import given_place, publish_anchored
-from tests.service.map_sets import copy_map, instants
+from tests.service.rooms import copy_map, instants
 from visloc.archive import MapStore
 from visloc.kapture import read_dataset
 from visloc.priors import PositionPrior, Priors

@@ -29,9 +29,9 @@ class Query(Protocol):
 
 
 def test_a_photo_of_a_turned_camera_is_found_and_drawn(
-    upright_site: Path, query: Query, monkeypatch: pytest.MonkeyPatch
+    upright_room: Path, query: Query, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    store = MapStore(upright_site)
+    store = MapStore(upright_room)
     maps = [MapFolder(store.open("room").ref, store.folder("room"))]
     image = png(turned_pixels(read_photo(query.image).rgb, 3))
     camera, truth = turned_camera(query.camera, 3), turned_pose(query.cam_from_world, 3)

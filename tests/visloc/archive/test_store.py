@@ -14,9 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from visloc.archive import MapStore
+from visloc.archive import MapStore, read_any_outline
 from visloc.archive.checks import json_text, manifest_hash
-from visloc.archive.sets import read_any_outline
 from visloc.errors import Conflict, Forbidden, MapCorrupt, NotFound, StorageFull
 
 

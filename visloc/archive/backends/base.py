@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Protocol
 
 from visloc.archive.reader import MapOutline
+from visloc.archive.set_outline import SetOutline
 from visloc.archive.set_rules import AnyManifest
-from visloc.archive.sets import SetOutline
 from visloc.errors import MapCorrupt
 
 CURRENT, MANIFEST = "current", "manifest.json"

@@ -21,8 +21,8 @@ from visloc.archive.backends.base import CURRENT, MANIFEST, text_of_current
 from visloc.archive.checks import check_files, read_any_manifest
 from visloc.archive.reader import MapOutline
 from visloc.archive.schema import ID_PATTERN
+from visloc.archive.set_outline import SetOutline, read_any_outline
 from visloc.archive.set_rules import AnyManifest
-from visloc.archive.sets import SetOutline, read_any_outline
 from visloc.archive.version_rules import refuse_renamed
 from visloc.errors import MapCorrupt, refuse
 

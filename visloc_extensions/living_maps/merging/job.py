@@ -10,7 +10,6 @@ import numpy as np
 
 from mapping.maps.cameras import origins_record
 from mapping.maps.editing import content_of, joined, moved, refuse_other_features, same_model
-from mapping.maps.sets import publish_set
 from mapping.own_test.publishing import publish_edited, refuse_not_accepted
 from mapping.pipeline.pieces import without_pieces
 from mapping.stages.publishing import photo_files, sole_publisher
@@ -20,6 +19,7 @@ from visloc.errors import refuse
 from visloc.geometry import Similarity
 from visloc.retrieval.fusion import EQUAL_GHARM
 from visloc_extensions.living_maps.merging.registration import Registration, register, updates_of
+from visloc_extensions.sets.publishing import publish_set
 
 # Least part of the photos of B that must be tied to A.
 MIN_OVERLAP = 0.1

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from clients import Client
-from tests.service.map_sets import busy, state_of, wait_until
+from tests.service.rooms import busy, state_of, wait_until
 from visloc.archive import MapStore
 from visloc.priors import Priors
 from visloc_extensions.object_storage.remote_store import RemoteMapStore

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from tests.visloc.archive.test_sets import LARGE, assert_told_by_manifests, mix_up_files
-from visloc.archive import MapStore, SetOutline, open_set
+from visloc.archive import MapStore, SetOutline
 from visloc.errors import Conflict, NotFound
 from visloc_extensions.object_storage.remote_store import RemoteMapStore
+from visloc_extensions.sets.files import open_set
+from visloc_extensions.sets.tests.test_files import LARGE, assert_told_by_manifests, mix_up_files
 
 
 def test_a_url_keeps_the_same_rules(incoming: Callable[..., Path], tmp_path: Path) -> None:
