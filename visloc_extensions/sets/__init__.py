@@ -1,1 +1,1 @@
-"""Searching a set of maps: its tiles for a photo, and one answer (docs/map-sets.md)."""
+"""Searching a set of maps: its tiles for a photo, and one answer (README.md)."""

@@ -1,4 +1,4 @@
-"""Cutting a large map into tiles on a grid, and these into a set (docs/map-sets.md)."""
+"""Cutting a large map into tiles on a grid, and these into a set (README.md)."""
 
 from __future__ import annotations
 

@@ -8,6 +8,7 @@ import pytest
 
 from tests.visloc.answers import localized, refused
 from visloc.archive import Anchor, Geodetic, SetOutline
+from visloc.archive.set_outline import tiles_near
 from visloc.errors import InvalidInput, NotFound
 from visloc.geodesy import geodetic_from_enu
 from visloc.geometry import Pose
@@ -26,7 +27,6 @@ from visloc_extensions.sets.choosing import (
     is_doubtful,
     nearest_tile,
     plan,
-    tiles_near,
 )
 from visloc_extensions.sets.coarse import TileScore
 
