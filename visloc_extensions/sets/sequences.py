@@ -27,7 +27,7 @@ from service.values import (
 from service.workers.pool import Workers
 from service.workers.tasks import Vision
 from visloc.archive import SetOutline
-from visloc.errors import InvalidInput, NotFound, Unavailable, inside
+from visloc.errors import InvalidInput, NotFound, Unavailable, inside, placed
 from visloc.priors import Priors
 from visloc_extensions.sets.choosing import allowed_tiles, nearest_tile
 from visloc_extensions.sets.search import SetSearch, priors_in, rig_in, with_queries
@@ -66,7 +66,8 @@ class SequenceInSet:
             if isinstance(error, Unavailable) and error.code != "set.tile_unavailable":
                 raise
             if self._row is None or not allowed[self._row]:
-                raise
+                of_instant = (error.field or "").startswith("images")
+                raise (placed(error, f"instants[{index}]") if of_instant else error) from None
             # Tiles that cannot be opened, or cannot take the images, do not end a sequence that is
             # elsewhere.
             allowed[:] = False
