@@ -14,6 +14,7 @@ from tests.mapping.conftest import walk  # noqa: F401
 from tests.mapping.own_test.test_verdict import broken  # noqa: F401
 from tests.mapping.pipeline.test_retrieval_only import bare  # noqa: F401
 from tests.service.conftest import in_study, serve, study, two_rooms  # noqa: F401
+from tests.visloc.conftest import hall, place  # noqa: F401
 
 if TYPE_CHECKING:
     from visloc.archive import SetOutline
