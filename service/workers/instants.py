@@ -40,8 +40,6 @@ from visloc.types import (
     InstantAnswer,
     MaskedImage,
     QueryFeatures,
-    Reason,
-    Refusal,
     RigSensor,
 )
 
@@ -101,15 +99,8 @@ class Target:
             if error.code.startswith(_OF_ALL_IMAGES):
                 raise
             return SeenImage(image.sensor, sensor.cam_from_rig, None, error)
-        if look.refusal is None and not self._is_named(priors):
-            look = _nothing_here(look)
         evidence = replace(look.evidence, seconds=summed(seconds, look.evidence.seconds))
         return SeenImage(image.sensor, sensor.cam_from_rig, replace(look, evidence=evidence))
-
-    def _is_named(self, priors: Priors) -> bool:
-        """Whether this tile is one of those that the priors name, if they name tiles."""
-        opened = self.localizer.map
-        return priors.maps is None or not {opened.manifest.id, opened.ref}.isdisjoint(priors.maps)
 
 
 class SolvedInMap(NamedTuple):
@@ -216,16 +207,6 @@ def check_priors(targets: Sequence[Target], priors: Priors) -> None:
     """Refuse priors that a map cannot apply, before anything is computed."""
     for target in targets:
         Constraints(target.localizer.geometry, priors)
-
-
-def _nothing_here(look: Look) -> Look:
-    """Return what an image shows of a tile that the priors exclude."""
-    return Look.nothing(
-        replace(look.evidence, num_correspondences=0, retrieved=()),
-        Refusal(
-            "retrieval", Reason.NO_PHOTO_NEAR, "the priors name other tiles, which do not show this"
-        ),
-    )
 
 
 # Returns the extractor of local features with this name.

@@ -122,13 +122,11 @@ class SequenceInSet:
 
         async def ask(row: int, folder: MapFolder, queries: Sequence[Query]) -> Localization:
             tile = self._outline.tiles[row]
-            # The names of tiles stay, as the nearest one may not be among them.
-            priors = replace(priors_in(self._outline, tile, job.priors), maps=job.priors.maps)
             asked = replace(
                 job,
                 images=with_queries(job.images, queries),
                 rig=rig_in(tile, job.rig),
-                priors=priors,
+                priors=priors_in(self._outline, tile, job.priors),
             )
             bare, looks = await check_and_look(self._workers, asked, (folder,))
             found, solved[row] = await self._workers.run(
