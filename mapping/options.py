@@ -49,11 +49,7 @@ def names_in(text: str) -> tuple[str, ...]:
 
 
 def gravity_in(text: str) -> Vector:
-    """Read ``X,Y,Z``.
-
-    Raises:
-        InvalidInput: ``build.gravity``.
-    """
+    """Read ``X,Y,Z``."""
     try:
         x, y, z = (float(number) for number in text.split(","))
     except ValueError:

@@ -63,10 +63,6 @@ def write_sample(
         seed: of pictures in the room, sensor noise and GNSS errors.
         size: width, height in pixels.
         progress: called after each photo with the photos done, and the total.
-
-    Raises:
-        Conflict: ``sample.exists`` if the folder holds something already.
-        InvalidInput: ``sample.images``, ``sample.seed`` or ``sample.size``.
     """
     _check(root, images, seed, size)
     root = root.resolve()
@@ -101,7 +97,6 @@ class _Run:
     Attributes:
         name: folder, and first part of every image name.
         number: part of the seed of its noise.
-        rig_from_world: pose at each instant.
         num_photos: two per instant; the last right one may be missing.
     """
 

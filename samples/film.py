@@ -31,11 +31,8 @@ def film_walk(
     """Render a frame at each pose and write them as a video.
 
     Args:
-        path: of the video; its suffix names the container.
-        camera: a PINHOLE with even width and height.
         cams_from_world: one for each frame.
         rate: frames per second.
-        seed: of the noise.
     """
     noise = np.random.default_rng(seed)
 

@@ -36,7 +36,6 @@ def light(
         images: (H, W, 3) uint8 each.
         rectangles: (corner, edge_u, edge_v) of each, (3,) metres; the first six are the shell of
             the room, which cannot stand between anything.
-        room_size_m: length, width, height.
     """
     grids = [_spots(*rectangle) for rectangle in rectangles]
     normals = [

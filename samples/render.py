@@ -45,17 +45,9 @@ class _Hits:
 def render_depth(scene: Scene, camera: Camera, cam_from_world: Pose) -> NDArray[np.float64]:
     """Return the depth through every pixel's centre.
 
-    Args:
-        scene: what is seen.
-        camera: a PINHOLE.
-        cam_from_world: its pose.
-
     Returns:
         (height, width) metres along the optical axis, exact to rounding; 0 where there is
         nothing.
-
-    Raises:
-        InvalidInput: ``camera.model`` if the camera is no PINHOLE.
     """
     inverse_depth = _cast(scene, camera, cam_from_world, 1, np.float64).inverse_depth
     depth = np.zeros_like(inverse_depth, dtype=np.float64)
@@ -70,16 +62,11 @@ def render_photo(
 
     Args:
         scene: what is seen; black where there is nothing.
-        camera: a PINHOLE.
-        cam_from_world: its pose.
         noise: adds sensor noise of about one grey level; none without it.
 
     Returns:
         (height, width, 3) uint8 RGB. A pixel is the mean colour over its square, whose centre
         is (0.5, 0.5) for the top-left one.
-
-    Raises:
-        InvalidInput: ``camera.model`` if the camera is no PINHOLE.
     """
     hits = _cast(scene, camera, cam_from_world, _RAYS, np.float32)
     order = np.argsort(hits.rectangle, axis=None, kind="stable").astype(np.int32)

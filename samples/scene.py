@@ -71,10 +71,8 @@ def make_room(
     """Build the room; its furniture stands still, every picture in it depends on the seed.
 
     Args:
-        seed: of the pictures.
         repainted: numbers of surfaces, below ``NUM_SURFACES``, whose pictures depend on another
             seed: they make rooms that resemble each other.
-        repainted_seed: that seed.
     """
     boards = _boards()
     painted = []

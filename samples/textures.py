@@ -61,11 +61,8 @@ def value_noise(
     """Sum smooth random fields, each of half the amplitude and half the cell of the one before.
 
     Args:
-        rng: source of randomness.
-        height: rows of the result.
         width: columns of the result.
         cell: (along rows, along columns) size in texels of the largest cells.
-        octaves: how many fields.
 
     Returns:
         (height, width) float32, about -1 to 1.
@@ -130,9 +127,6 @@ def shapes(
     distance.
 
     Args:
-        image: painted in place.
-        rng: source of randomness.
-        colours: to choose from.
         radii: (largest, smallest) in texels.
         coverage: share of the image that the largest would cover if they did not overlap; each
             halving of the size covers 0.8 times as much.

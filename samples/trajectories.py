@@ -23,12 +23,7 @@ _HEIGHT_M = 1.45
 
 @dataclass(frozen=True, slots=True)
 class RigCamera:
-    """A camera of the rig.
-
-    Attributes:
-        camera: its intrinsics.
-        cam_from_rig: its place on the rig.
-    """
+    """A camera of the rig."""
 
     camera: Camera
     cam_from_rig: Pose

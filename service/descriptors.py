@@ -24,9 +24,6 @@ def fit_connections(settings: ServiceSettings) -> ServiceSettings:
     """Raise the soft limit of open files as needed, or lower ``max_connections``.
 
     HTTP and gRPC have ``max_connections`` each. Processes that are started later inherit the limit.
-
-    Raises:
-        SettingsError: the hard limit leaves too few for connections.
     """
     own = _OWN + _PER_WORKER * settings.workers + METRICS_CONNECTIONS
     needed = own + 2 * settings.max_connections

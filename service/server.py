@@ -42,12 +42,7 @@ _BACKLOG = 512
 
 
 class Server:
-    """Listens once constructed, answers after ``open``, localizes after ``load``.
-
-    Raises:
-        OSError: when an address cannot be listened on.
-        SettingsError: when a setting cannot be used.
-    """
+    """Listens once constructed, answers after ``open``, localizes after ``load``."""
 
     def __init__(self, settings: ServiceSettings) -> None:
         self._settings = settings
@@ -177,8 +172,6 @@ class _HttpServer(uvicorn.Server):
     """uvicorn on a socket that already listens.
 
     Args:
-        app: answers.
-        listener: the listening socket.
         max_connections: limit of open connections; further ones are closed at once.
         certificate: for TLS; None for plain HTTP.
     """

@@ -166,12 +166,7 @@ def default_workers() -> int:
 
 
 def read_settings(arguments: Sequence[str], environment: Mapping[str, str]) -> ServiceSettings:
-    """Merge flags, ``VISLOC_`` variables, the file that ``--config`` names, and defaults.
-
-    Raises:
-        SettingsError: for an unknown name or a value that cannot be used.
-        SystemExit: from argparse, for ``--help`` and unknown flags.
-    """
+    """Merge flags, ``VISLOC_`` variables, the file that ``--config`` names, and defaults."""
     flags = vars(_parser().parse_args(arguments))
     file = flags.pop("config", environment.get(CONFIG_VARIABLE) or None)
     variables = _from_environment(environment)

@@ -108,7 +108,6 @@ class InstantJob:
     """One instant of a sequence.
 
     Attributes:
-        timestamp: greater than the one before.
         images: each of another sensor; may be empty when there is odometry.
         priors: None for those of the sequence.
     """
@@ -194,11 +193,7 @@ class Localization:
 
 
 def check_order(before: int, timestamp: int) -> None:
-    """Refuse an instant of a sequence that is not after the one before it.
-
-    Raises:
-        InvalidInput: ``sequence.timestamps``.
-    """
+    """Refuse an instant of a sequence that is not after the one before it."""
     if timestamp <= before:
         raise refuse(
             "sequence.timestamps",
@@ -237,8 +232,6 @@ class WorkerSettings:
     Attributes:
         threads: most processor threads for one photo.
         max_loaded_bytes: maps that stay open.
-        max_images: of one instant.
-        max_instants: of one sequence.
         max_image_bytes: of an encoded photo.
         max_image_pixels: of a photo.
         configure_logging: runs first in every process, which pickles it; None to log as Python
@@ -277,7 +270,6 @@ class SequenceStep(NamedTuple):
 
     Attributes:
         maps: references of those that are still searched.
-        answers: those that are final.
     """
 
     sequence: PackedSequence

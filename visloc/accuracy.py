@@ -27,7 +27,6 @@ class Compared:
     """A photo whose true pose is known.
 
     Attributes:
-        truth: ``cam_from_world``.
         pose: the estimated ``cam_from_world``; None when the photo has none.
         covariance: (6, 6) of ``pose``, of rotation (rad) then translation; None when unknown.
     """

@@ -159,11 +159,8 @@ def refuse(
     Args:
         code: one of the catalogue, or of a family in it.
         message: instead of the catalogue's sentence, where the place knows more.
-        field: the field, option or file that is wrong.
         expected: what would have been right, or the words to choose from; else the catalogue's.
-        got: what came instead.
         kind: instead of the code's first kind.
-        values: what the sentence names in braces.
     """
     entry = _entry(code)
     if expected is None:

@@ -75,10 +75,6 @@ def recall(
     Args:
         errors: (metres, degrees) of each localized query, as ``pose_error`` gives them.
         num_queries: all queries; those without an error count as failures.
-        thresholds: what counts as success.
-
-    Raises:
-        InvalidInput: ``evaluation.num_queries`` if there are none, or fewer than errors.
     """
     if not 0 < num_queries >= len(errors):
         raise refuse(

@@ -66,7 +66,6 @@ def geopose_of(device_from_world: Pose, geodetic: Geodetic) -> GeoPose:
     """Return the GeoPose of a camera, or of a rig.
 
     Args:
-        device_from_world: its pose in the map.
         geodetic: where the map's world lies.
     """
     anchor = origin_of(geodetic)
@@ -125,7 +124,6 @@ def earth_covariance(
     (``rms``) is known, a third of its square goes to each axis.
 
     Args:
-        device_from_world: the pose in the map.
         covariance: (6, 6) of rotation (rad) then translation, for R <- Exp(w) R and t <- t + dt.
         anchor: what the map's place on Earth rests on.
     """

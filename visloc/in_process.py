@@ -44,12 +44,10 @@ class PhotoResult:
     """A photo that a map was asked about.
 
     Attributes:
-        map: the map.
         name: of the photo in its folder.
         path: of the photo's file.
         camera: the intrinsics that were given; None when they were unknown.
         options: those of the query.
-        priors: those of the query.
         answer: the pose or the refusal; None when the photo could not be used.
         error: why it could not be used.
         truth: the true ``cam_from_world``, where the folder knows it. No query sees it.
@@ -133,9 +131,6 @@ class PhotoResult:
         Returns:
             The decoded photo, its matches with the map, and for each match (n,) whether the best
             pose explains it.
-
-        Raises:
-            VislocError: ``error``, for a photo that could not be used.
         """
         if self.answer is None:
             assert self.error is not None  # one of both is there
@@ -179,22 +174,14 @@ class FolderResult(Sequence[PhotoResult]):
         return [photo.row() for photo in self]
 
     def table(self) -> DataFrame:
-        """Return a pandas table: a row for each photo (``PhotoResult.row``), by its name.
-
-        Raises:
-            InvalidInput: ``notebook.packages`` where pandas is not installed.
-        """
+        """Return a pandas table: a row for each photo (``PhotoResult.row``), by its name."""
         require("pandas")
         import pandas as pd
 
         return pd.DataFrame(self.rows()).set_index("name")
 
     def accuracy(self, thresholds: Sequence[Threshold] = DEFAULT_THRESHOLDS) -> dict[str, Any]:
-        """Score the photos whose true poses are known, as ``localize evaluate`` does.
-
-        Raises:
-            InvalidInput: ``notebook.no_truth`` when no true pose is known.
-        """
+        """Score the photos whose true poses are known, as ``localize evaluate`` does."""
         compared = [
             Compared(
                 photo.truth,
@@ -210,11 +197,7 @@ class FolderResult(Sequence[PhotoResult]):
 
 
 class LocalMap:
-    """A map that is asked in this process. ``open_map`` makes one.
-
-    Attributes:
-        localizer: what answers.
-    """
+    """A map that is asked in this process. ``open_map`` makes one."""
 
     def __init__(self, localizer: Localizer) -> None:
         self.localizer = localizer
@@ -238,15 +221,10 @@ class LocalMap:
         """Find where a photo was taken.
 
         Args:
-            photo: the path of its file.
             camera: its intrinsics for the pixels as stored; None takes the focal length of EXIF, or
                 estimates it.
             options: thresholds and the like.
             priors: what is known of the camera.
-
-        Raises:
-            NotFound: ``image.missing``.
-            VislocError: as ``Localizer.localize`` and ``read_photo_file``.
         """
         path = Path(photo)
         asked = PhotoResult(self, path.name, path, camera, options, priors, None)
@@ -269,11 +247,6 @@ class LocalMap:
 
         Returns:
             An answer for each photo; one that cannot be used has ``error``.
-
-        Raises:
-            NotFound: ``notebook.no_photos`` when there is no photo.
-            DatasetError: as ``read_dataset``.
-            InvalidInput: options that do not fit the map, as ``Localizer.check``.
         """
         self.localizer.check(options)
         root = Path(folder)
@@ -327,11 +300,7 @@ def open_map(
 
 
 def require(package: str) -> None:
-    """Refuse to go on without a package of the extra ``notebook``.
-
-    Raises:
-        InvalidInput: ``notebook.packages``.
-    """
+    """Refuse to go on without a package of the extra ``notebook``."""
     if importlib.util.find_spec(package) is None:
         raise refuse("notebook.packages", got=f"no {package}")
 

@@ -87,9 +87,6 @@ def check_fusion_weights(weights: Mapping[str, float], code: str, field: str | N
 
     Args:
         field: what the weights are called where they were given; None for what the code says.
-
-    Raises:
-        InvalidInput: with the code.
     """
     field = code if field is None else field
     for name, weight in weights.items():
@@ -167,11 +164,8 @@ def _option(
 
     Args:
         default: its value when the caller leaves it out.
-        description: what it is, without its values.
         low: least value, when it is a number.
-        high: greatest value.
         unset: whose value is taken when the default is None.
-        details: sentences to add.
     """
     metadata = {
         "description": description,

@@ -44,9 +44,6 @@ def matches(result: PhotoResult) -> Image.Image:
     """Draw a photo's matches beside the mapping photos that they were found in.
 
     Green rings are inliers, red crosses are outliers. The photo is matched once more.
-
-    Raises:
-        VislocError: ``result.error``, for a photo that could not be used.
     """
     photo, look, inliers = result.look_again()
     assert result.answer is not None  # look_again raises its error
@@ -55,12 +52,7 @@ def matches(result: PhotoResult) -> Image.Image:
 
 
 def reprojections(result: PhotoResult) -> ShownFigure:
-    """Draw where the pose puts the landmarks of the inliers, in the photo and as errors in pixels.
-
-    Raises:
-        InvalidInput: ``notebook.no_pose`` for a photo that was not localized;
-            ``notebook.packages``.
-    """
+    """Draw where the pose puts the landmarks of the inliers, and their errors in pixels."""
     answer = result.answer
     if not isinstance(answer, Localized):
         raise refuse("notebook.no_pose", field=result.name)
@@ -95,14 +87,6 @@ def retrieval(result: PhotoResult, most: int = 9) -> ShownFigure:
     """Draw a photo and the mapping photos that retrieval found for it, best first.
 
     A map that keeps no photos shows the keypoints of their landmarks instead.
-
-    Args:
-        result: of the photo.
-        most: mapping photos to draw.
-
-    Raises:
-        VislocError: ``result.error``, for a photo that could not be used.
-        InvalidInput: ``notebook.packages``.
     """
     if result.answer is None:
         assert result.error is not None  # one of both is there
@@ -143,12 +127,8 @@ def map_3d(
     Blue cameras are mapping photos, green ones localized photos, orange ones their true poses.
 
     Args:
-        opened: the map.
         results: of photos; those without a pose are left out.
         most_landmarks: landmarks to draw. A part of them samples the map evenly.
-
-    Raises:
-        InvalidInput: ``notebook.packages``.
     """
     require("plotly")
     from plotly import graph_objects
@@ -185,9 +165,6 @@ def errors(results: Mapping[str, Sequence[PhotoResult]] | Sequence[PhotoResult])
 
     Args:
         results: of one folder, or of several by name. Photos without a true pose are left out.
-
-    Raises:
-        InvalidInput: ``notebook.no_truth`` when no true pose is known; ``notebook.packages``.
     """
     named = results if isinstance(results, Mapping) else {"": results}
     figure, (both,) = _subplots(1, 2, (11.0, 3.8), sharey=True)

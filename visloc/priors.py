@@ -212,11 +212,7 @@ NO_PRIORS = Priors()
 
 
 def check_covariance(covariance: NDArray[np.float64], field: str) -> None:
-    """Refuse what is not the covariance (6, 6) of a pose.
-
-    Raises:
-        InvalidInput: ``pose.covariance``.
-    """
+    """Refuse what is not the covariance (6, 6) of a pose."""
     fine = covariance.shape == (6, 6) and _usable(covariance)
     if fine:
         scale = np.sqrt(np.abs(np.diag(covariance)))

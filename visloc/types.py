@@ -246,7 +246,6 @@ class Evidence:
 
     Attributes:
         camera: the intrinsics used, for the pixels as stored.
-        camera_source: where they came from.
         exif_orientation: the photo's EXIF orientation, 1 to 8; 1 when it has none or was not sent.
         read_as: the orientation in which features were found, ``UPRIGHT`` or ``STORED``.
         turned: degrees clockwise by which the photo was turned beyond that, because the map did
@@ -282,7 +281,6 @@ class Candidate:
     Attributes:
         rig_from_world: the pose there, in the frame of ``map``; of the camera, for a photo on its
             own.
-        num_inliers: keypoints that agree with it.
         map: ``id@version`` of the map, or of the set of maps.
         tile: of a set, ``id@version`` of the map in it; None otherwise.
         image: the mapping photo that speaks most for this place; None when none is known.
@@ -303,7 +301,6 @@ class CoarsePose:
     """Where retrieved photos say that a photo was taken; no keypoint confirms it.
 
     Attributes:
-        cam_from_world: the pose.
         covariance: (6, 6) float64 of rotation (rad) then translation, for R <- Exp(w) R and
             t <- t + dt of ``cam_from_world``: an ellipsoid of 95 % holds for photos of this map.
         position_std: (3,) standard deviations of the camera centre along the world's axes.
@@ -370,7 +367,6 @@ class Localized:
     """A photo's pose that passed the gate: the pose of the rig of one camera that it is.
 
     Attributes:
-        evidence: what led to it.
         pose: as its own measurements gave it; the properties below read it as a camera's.
         inlier_keypoints: (N, 2) float32 pixels of the photo as stored.
         inlier_points: (N, 3) float64 in the world.
@@ -428,10 +424,6 @@ class NotLocalized:
     """The map was searched and gave no pose that can be trusted.
 
     Attributes:
-        evidence: how far it came.
-        stage: the stage that gave up.
-        reason: why, as a stable word.
-        message: why, for a person.
         candidates: the places of an ambiguous photo that have a pose; () otherwise.
         coarse: a pose told by retrieval alone, if the query asked for one.
     """
@@ -458,7 +450,6 @@ class ImageAnswer:
 
     Attributes:
         sensor: the camera's id in the rig.
-        cam_from_rig: where it sits.
         evidence: what was seen in it; inliers are those of the rig's pose. None when the image
             could not be used.
         error: why it could not be used, or None.

@@ -113,12 +113,7 @@ class DatasetRun(Photos, QueryOptions):
         return None if self.pairs is None else read_query_pairs(self.pairs, queries.photos)
 
     def read_matches(self, pairs: Mapping[str, tuple[str, ...]] | None) -> PhotoMatches | None:
-        """Open the matches, if there are any.
-
-        Raises:
-            InvalidInput: ``queries.matches_dir`` without pairs.
-            DatasetError: as ``open_matches``.
-        """
+        """Open the matches, if there are any."""
         if self.matches_dir is None:
             return None
         if pairs is None:

@@ -108,11 +108,7 @@ class Connection:
     ] = DEFAULT_TIMEOUT_S
 
     def client(self) -> Client:
-        """Make a client.
-
-        Raises:
-            OSError: when the file with the key cannot be read.
-        """
+        """Make a client."""
         return Client(self.server, api_key=self._api_key, ca=self.ca, timeout_s=self.timeout_s)
 
     def async_client(self) -> AsyncClient:
@@ -155,11 +151,7 @@ class QueryOptions:
 
     @property
     def options(self) -> LocalizeOptions:
-        """The options of a query.
-
-        Raises:
-            InvalidInput: as ``options_from_texts``.
-        """
+        """The options of a query."""
         seed = [] if self.seed is None else [f"seed={self.seed}"]
         return options_from_texts([*(self.option or ()), *seed])
 
@@ -232,21 +224,12 @@ Thresholds = Annotated[
 
 
 def thresholds_of(texts: Sequence[str] | None) -> Sequence[Threshold]:
-    """Parse the texts of ``--threshold``.
-
-    Raises:
-        InvalidInput: ``evaluation.threshold``.
-    """
+    """Parse the texts of ``--threshold``."""
     return [parse_threshold(text) for text in texts or ()] or DEFAULT_THRESHOLDS
 
 
 def priors_from_text(text: str) -> visloc.priors.Priors:
-    """Parse priors: JSON, or the path of a file that holds it.
-
-    Raises:
-        InvalidInput: ``priors.unreadable`` for neither, ``request.unknown_field``,
-            ``request.invalid``, ``priors...`` or ``pose...``.
-    """
+    """Parse priors: JSON, or the path of a file that holds it."""
     try:
         raw = json.loads(text if text.lstrip().startswith("{") else Path(text).read_bytes())
     except (OSError, ValueError) as error:

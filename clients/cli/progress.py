@@ -26,8 +26,6 @@ def run_with_progress(
 
     Args:
         work: takes the function that advances the bar by one.
-        what: the things that are counted.
-        total: their number.
         if_stopped: tells the person who stops the run what becomes of it.
     """
     columns = (

@@ -37,11 +37,9 @@ class Batch:
 
     Attributes:
         output: holds ``results.jsonl``, ``poses.txt``, ``poses_filled.txt`` and ``run.json``.
-        source: the dataset or list.
         features_dir: of the photos' features, when they are not in the dataset.
         pixel_origin: of the dataset's cameras and keypoints.
         map_ref: ``id@version``, so that all results are of one map.
-        mode: how poses are filled.
         further: options that not every run has, for the description.
     """
 
@@ -84,11 +82,6 @@ def open_batch(batch: Batch, *, restart: bool) -> set[str]:
     """Prepare the folder and return the names of the photos that are done.
 
     A photo is done when the folder has its result, unless that is an error of the server.
-
-    Raises:
-        Conflict: ``batch.other_run`` when the folder holds results of another run and ``restart``,
-            which removes them, is not set.
-        DatasetError: ``results.line`` when ``results.jsonl`` is damaged.
     """
     batch.output.mkdir(parents=True, exist_ok=True)
     if restart:
@@ -122,11 +115,7 @@ async def run_batch(
     concurrency: int,
     on_outcome: Callable[[_Outcome], None],
 ) -> None:
-    """Localize photos or instants; each one's results are appended to the folder at once.
-
-    Raises:
-        VislocError: an error that makes going on pointless; the results so far are kept.
-    """
+    """Localize photos or instants; each one's results are appended to the folder at once."""
     with batch.results.open("a", encoding="utf-8") as file:
 
         def keep(outcome: _Outcome) -> None:

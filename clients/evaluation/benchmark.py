@@ -66,11 +66,7 @@ class Run:
 
 
 def parse_threshold(text: str) -> Threshold:
-    """Parse ``METRES/DEGREES`` such as ``0.25/2``.
-
-    Raises:
-        InvalidInput: ``evaluation.threshold``.
-    """
+    """Parse ``METRES/DEGREES`` such as ``0.25/2``."""
     try:
         position_m, orientation_deg = (float(part) for part in text.split("/"))
         if math.isfinite(position_m) and math.isfinite(orientation_deg):
@@ -100,9 +96,6 @@ def make_report(
 
     Args:
         runs: by mode, in the order of the table; the first one's figures are also at the top.
-        poses: of all photos, filled as the mode does.
-        server: that answered.
-        map_info: the map that was searched.
     """
     modes = {mode.value: figures_of(run, poses[mode], thresholds) for mode, run in runs.items()}
     first = next(iter(modes.values()))

@@ -75,9 +75,6 @@ def photo_result(result: InstantResult, index: int) -> LocalizeResult:
     The pose is the rig's, seen from the camera. A photo without an inlier has none: the rig's
     pose then rests on the other cameras. Correspondences, inliers and retrieved images are the
     photo's own; the seconds are those of the whole instant.
-
-    Raises:
-        KeyError, TypeError, ValueError, InvalidInput: for answers that contradict themselves.
     """
     image, raw = result.images[index], result.raw["images"][index]
     pose, status, refusal = None, result.status, result.raw["refusal"]
@@ -127,11 +124,7 @@ def poses_from_rig(result: InstantResult, rig: Rig) -> dict[str, TracedPose]:
     They rest on the other cameras: their source is RIG, their covariance that of ``fill_rig``.
 
     Args:
-        result: the answer to an instant.
         rig: the rig. For a rig that the map knows, only the answer tells where its cameras sit.
-
-    Raises:
-        ValueError: for a pose without an inlier in any photo.
     """
     if not result.localized:
         return {}

@@ -33,13 +33,7 @@ def instants_of_dataset(queries: QuerySet, *, or_else: str = "") -> list[QueryIn
     The rig of a camera is the outermost one that carries it.
 
     Args:
-        queries: the photos and the rigs.
         or_else: names an alternative to rigs in the dataset, for the error.
-
-    Raises:
-        DatasetError: ``queries.no_rigs`` when no rig took a photo;
-            ``queries.rig_ambiguous`` when several rigs carry a camera;
-            ``queries.rig_transform`` when it is not known where a camera sits.
     """
     rig_of = {
         sensor_id: _rig_of(queries, sensor_id)
@@ -64,12 +58,7 @@ def instants_of_dataset(queries: QuerySet, *, or_else: str = "") -> list[QueryIn
 
 
 def instants_of_map_rig(queries: QuerySet, info: MapInfo, rig_id: str) -> list[QueryInstant]:
-    """Group the photos of a rig that the map knows by timestamp.
-
-    Raises:
-        NotFound: ``rig.unknown``.
-        DatasetError: ``queries.no_rigs`` when none of its cameras took a photo.
-    """
+    """Group the photos of a rig that the map knows by timestamp."""
     rigs = {rig.id: rig.sensors for rig in info.rigs}
     if rig_id not in rigs:
         raise refuse(

@@ -50,7 +50,6 @@ class Arrangement:
     """The groups of a dataset's photos that the modes need.
 
     Attributes:
-        photos: all of them.
         filled: the instants in which one camera's pose fills another's.
         asked: the instants that are sent in one request each.
         time_unit: of the timestamps; None when no mode needs it.
@@ -79,11 +78,7 @@ class Arrangement:
 
 
 def parse_modes(texts: Iterable[str]) -> list[Mode]:
-    """Parse modes, also with commas between; ``all`` is every mode, none at all is ``single``.
-
-    Raises:
-        InvalidInput: ``mode.unknown``.
-    """
+    """Parse modes, also with commas between; ``all`` is every mode, none at all is ``single``."""
     modes: list[Mode] = []
     for word in (word for text in texts for word in text.split(",")):
         if word == "all":
@@ -110,17 +105,9 @@ def arrange(
     """Group the photos of a dataset as the modes need it.
 
     Args:
-        queries: the photos and the rigs.
-        modes: the modes.
-        info: the map that is searched.
         rig_id: for ``gp3p``: a rig that the map knows, instead of the dataset's rigs.
         time_unit: of the timestamps; None infers it from their size.
         max_gap_s: longest time between the poses that others are filled from.
-
-    Raises:
-        DatasetError: ``queries.no_rigs`` and others of ``clients.evaluation.instants``;
-            ``queries.no_timestamps``, ``queries.time_unit``.
-        NotFound: ``rig.unknown``.
     """
     filled: list[QueryInstant] = []
     asked: list[QueryInstant] = []

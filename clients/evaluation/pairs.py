@@ -24,11 +24,6 @@ def of_photos(found: Mapping[str, _T], photos: Iterable[str]) -> tuple[dict[str,
     Returns:
         The values by the photos' names, and the number of names that stand for no photo; those that
         begin with ``#``, as comments do, aside.
-
-    Raises:
-        DatasetError: ``poses.ambiguous`` when a name ends the paths of several photos, or is that
-            of one as it stands and of another decoded; ``poses.duplicate`` when two names stand
-            for one photo.
     """
     photos = list(photos)
     exact = set(photos)
@@ -60,9 +55,6 @@ def read_query_pairs(path: Path, queries: Sequence[Query]) -> dict[str, tuple[st
 
     Scores are not used: like kapture and hloc, the file has the best photo first. Pairs of other
     photos are left out.
-
-    Raises:
-        DatasetError: as ``read_pair_rows``; ``pairs.no_query`` when it is about other photos only.
     """
     photos: dict[str, dict[str, None]] = {}
     for pair in read_pair_rows(path):

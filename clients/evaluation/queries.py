@@ -49,7 +49,6 @@ class QuerySet:
     """The photos to localize, and the rigs of their cameras.
 
     Attributes:
-        source: the folder or list.
         photos: in the order of the list, or by time, then by sensor.
         rigs: rig id -> sensor id -> ``cam_from_rig``, None where it is unknown; empty for a list.
     """
@@ -72,12 +71,6 @@ def read_queries(
     Args:
         source: the folder, the list, or a pattern of lists such as ``queries/*_time_queries.txt``.
         image_root: the folder that names in a list are relative to; by default that of the list.
-
-    Raises:
-        DatasetError: codes ``kapture.*``, ``list.*``, ``camera.*``; ``queries.missing`` when
-            there is nothing at ``source`` or no folder at ``image_root``, ``queries.empty`` when
-            it holds no photo.
-        InvalidInput: ``queries.image_root`` for a kapture folder.
     """
     if source.is_dir():
         if image_root is not None:

@@ -47,12 +47,7 @@ class FeatureReader:
     matches: PhotoMatches | None = None
 
     def __call__(self, query: Query) -> Features:
-        """Read the features of one photo.
-
-        Raises:
-            InvalidInput: ``camera.required`` when the dataset does not know the camera.
-            DatasetError: ``kapture.*``, with the file that is missing or wrong.
-        """
+        """Read the features of one photo."""
         if query.camera is None:
             raise refuse(
                 "camera.required",
@@ -99,12 +94,6 @@ def choose_reader(
     dataset or from ``features_dir``; any other takes photos. A request has either a photo or
     features. If only the global features are ready-made, the local ones are read from the folder
     of their name, as ``mapping export-features`` writes them.
-
-    Raises:
-        InvalidInput: ``queries.no_features`` for a list of photos and a map that takes features;
-            ``queries.features_dir`` for a map that takes photos; ``queries.matches_dir`` for
-            matches and a map whose local features are not ready-made.
-        DatasetError: ``kapture.*`` when the dataset has no such features.
     """
     ready_made = [name for name in info.global_features if name.startswith(READY_MADE_PREFIX)]
     if matches is not None and not info.local_features.startswith(READY_MADE_PREFIX):

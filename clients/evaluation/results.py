@@ -35,7 +35,6 @@ class StoredResult:
     Attributes:
         status: localized, coarse, not_localized or error; for a filled photo, its status before
             filling.
-        pose: when localized.
         filled: the pose from other photos, when the line has one.
         retrieved: names of the mapping photos that were matched against, best first.
         is_final: False for errors of the server: the photo is sent again.
@@ -100,11 +99,7 @@ def drop_torn_line(path: Path) -> None:
 
 
 def read_results(path: Path) -> Iterator[StoredResult]:
-    """Read ``results.jsonl``; a missing file has no lines.
-
-    Raises:
-        DatasetError: ``results.line``, with file and line.
-    """
+    """Read ``results.jsonl``; a missing file has no lines."""
     if not path.exists():
         return
     offset = 0
@@ -127,9 +122,6 @@ def copy_lines(
     """Copy lines of ``source`` to ``target``, in the order given; they may be the same file.
 
     Args:
-        source: what ``results`` were read from.
-        results: the lines.
-        target: written whole.
         filled: poses from other photos, by the photo's name. Lines of other photos lose theirs.
     """
     filled = filled or {}
@@ -164,11 +156,7 @@ def write_whole(path: Path, parts: Iterable[bytes]) -> None:
 
 
 def check_can_be_written(paths: Sequence[Path]) -> None:
-    """Check before a long run that its files can be written.
-
-    Raises:
-        InvalidInput: ``output.folder``.
-    """
+    """Check before a long run that its files can be written."""
     for path in paths:
         if path.is_dir() or not os.access(path.parent, os.W_OK):
             raise refuse(

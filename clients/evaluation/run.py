@@ -38,9 +38,7 @@ class Outcome:
     """The result of one photo, or the error that concerns this photo only.
 
     Attributes:
-        query: the photo.
         result: the answer, localized or not.
-        error: why there is no answer.
         seconds: from sending to the parsed answer, including waits for an overloaded server.
         filled: the pose that the other cameras of its rig give a photo without one of its own.
     """
@@ -68,7 +66,6 @@ class InstantOutcome:
     Attributes:
         photos: in the order of the instant; their seconds are the instant's.
         localized: whether the instant has a pose of its own.
-        has_answer: whether the server answered.
         seconds: as for ``Outcome``.
     """
 
@@ -83,7 +80,6 @@ class QueryClient:
     """A client, and what all queries of a run share.
 
     Attributes:
-        map_ref: ``id@version``.
         read: reads what is sent for a photo: its bytes or its features.
         pairs: names of the mapping photos by the photo's name; None when the server retrieves them.
     """
@@ -98,10 +94,6 @@ class QueryClient:
         """Localize one photo.
 
         A photo that cannot be read, or that the server refuses or fails on, fails alone.
-
-        Raises:
-            VislocError: an error that every photo would get, or that makes going on pointless,
-                such as a server that is gone.
         """
         started = time.perf_counter()
         try:
@@ -121,9 +113,6 @@ class QueryClient:
 
         Photos that cannot be read fail alone, and the others are sent. Photos that contribute
         nothing to the pose of their rig, by an error or without one, are filled.
-
-        Raises:
-            VislocError: as ``localize``.
         """
         images, errors = await self._read_images(instant)
         started = time.perf_counter()
@@ -196,9 +185,6 @@ async def localize_all(
     """Localize photos or instants, ``concurrency`` at a time, and report each one when it is done.
 
     Cancelling abandons the items under way; those reported are done.
-
-    Raises:
-        VislocError: the first error of ``localize``.
     """
     waiting = iter(items)
 

@@ -20,7 +20,6 @@ class PhotoMatches:
     """Matches in kapture's layout, of photos and mapping photos with features of one type.
 
     Attributes:
-        files: the matches.
         pairs: names of the mapping photos by the photo's name.
     """
 
@@ -31,10 +30,6 @@ class PhotoMatches:
         """Return the matches (k, 3) of a photo by mapping photo: a row, and x, y of the other.
 
         A pair without a file has no match.
-
-        Raises:
-            DatasetError: as ``MatchFiles.read``; ``kapture.match_values`` for a keypoint that the
-                mapping photo does not have.
         """
         return {photo: self._of(name, photo, keypoints_of) for photo in self.pairs.get(name, ())}
 

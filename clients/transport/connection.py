@@ -41,11 +41,7 @@ class Connection:
 def checked_connection(
     server: str, timeout_s: float, api_key: str | None, ca: str | Path | None
 ) -> Connection:
-    """Check the arguments of a client, and read the file of certificates.
-
-    Raises:
-        InvalidInput: ``server.url``, ``server.api_key``, ``server.ca``.
-    """
+    """Check the arguments of a client, and read the file of certificates."""
     connection = Connection(checked_server(server), timeout_s, api_key, _authorities(ca))
     if api_key is not None and not _KEY.fullmatch(api_key):
         raise refuse("server.api_key", field="api_key")

@@ -63,11 +63,7 @@ class GrpcTransport:
         self._channel: grpc.aio.Channel | None = None
 
     async def send(self, request: Request) -> JsonObject:
-        """Return the answer as plain JSON, the same as over HTTP.
-
-        Raises:
-            VislocError: what the server refused, or ``server.*``.
-        """
+        """Return the answer as plain JSON, the same as over HTTP."""
         path, message, decode = _encode(request)
         make_call = self._opened().unary_unary(path, None, None)
         metadata = _metadata(self._connection, request)
@@ -82,11 +78,7 @@ class GrpcTransport:
     async def stream(
         self, start: StartSequence, instants: AsyncIterable[Instant]
     ) -> AsyncGenerator[JsonObject, None]:
-        """Send instants as the server takes them, and give each answer as it comes.
-
-        Raises:
-            VislocError: as ``send``.
-        """
+        """Send instants as the server takes them, and give each answer as it comes."""
         make_call: Any = self._opened().stream_stream(_SEQUENCE, None, None)
         call = partial(make_call, metadata=_metadata(self._connection, start))
         answers = stream_answers(call, self._server, self._timeout_s, start, instants)
@@ -95,11 +87,7 @@ class GrpcTransport:
                 yield answer
 
     async def upload(self, upload: Upload, on_progress: OnProgress) -> JsonObject:
-        """Send a packed map, and return its description; ``on_progress`` is called in a thread.
-
-        Raises:
-            VislocError: as ``send``, and what reading the file raises.
-        """
+        """Send a packed map, and return its description; ``on_progress`` is called in a thread."""
         # Not grpc.aio: it loses the answer to a call that is still being written.
         channel = _open_channel(grpc, self._connection)
         try:
@@ -156,11 +144,7 @@ def _open_channel(library: Any, connection: Connection) -> Any:
 
 
 def _refuse_after_fork() -> None:
-    """Refuse to wait for an answer that never comes: grpc.aio does not survive a fork.
-
-    Raises:
-        RuntimeError: in a process that was forked from one in which gRPC was used.
-    """
+    """Refuse to wait for an answer that never comes: grpc.aio does not survive a fork."""
     global _process
     if _process not in (None, os.getpid()):
         raise RuntimeError(

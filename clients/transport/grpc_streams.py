@@ -39,11 +39,7 @@ async def stream_answers(
 
     Args:
         timeout_s: longest time without an answer while the server has an instant to work on.
-        start: the first message.
         instants: the first one is taken before anything is sent.
-
-    Raises:
-        VislocError: what the server refused, or ``server.*``.
     """
     waiting = aiter(instants)
     first = await anext(waiting, None)

@@ -51,11 +51,7 @@ class HttpTransport:
         self._http = httpx.AsyncClient(**_options(connection))
 
     async def send(self, request: Request) -> JsonObject:
-        """Return the answer as plain JSON.
-
-        Raises:
-            VislocError: what the server refused, or ``server.*``.
-        """
+        """Return the answer as plain JSON."""
         got = await self._ask(request)
         if may_resend(request, got):
             await asyncio.sleep(RESEND_PAUSE_S)
@@ -67,11 +63,7 @@ class HttpTransport:
     async def stream(
         self, start: StartSequence, instants: AsyncIterable[Instant]
     ) -> AsyncGenerator[JsonObject, None]:
-        """Send all instants in one request, and give each answer as it comes.
-
-        Raises:
-            VislocError: as ``send``.
-        """
+        """Send all instants in one request, and give each answer as it comes."""
         sent = [instant async for instant in instants]
         method, path, parts = encode_sequence(start, sent, self._timeout_s)
         try:
@@ -85,11 +77,7 @@ class HttpTransport:
             raise self._failure(error) from error
 
     async def upload(self, upload: Upload, on_progress: OnProgress) -> JsonObject:
-        """Send a packed map, and return its description.
-
-        Raises:
-            VislocError: as ``send``, and what reading the file raises.
-        """
+        """Send a packed map, and return its description."""
         method, path, parts = encode_upload(upload, self._timeout_s)
         try:
             _refuse_published(upload, await self._http.get(path))
@@ -164,11 +152,7 @@ def _decode(server: str, request: Request | None, response: httpx.Response) -> J
 
 
 def _refuse_published(upload: Upload, described: httpx.Response) -> None:
-    """Refuse before sending: the server's own refusal is read only after the whole file is sent.
-
-    Raises:
-        Conflict: ``map.version_exists``.
-    """
+    """Refuse before sending: the server's own refusal is read only after the whole file is sent."""
     if described.status_code == 200:
         raise refuse(
             "map.version_exists",
@@ -188,11 +172,7 @@ def _check_lines(server: str, response: httpx.Response) -> None:
 
 
 async def _lines(server: str, chunks: AsyncIterable[bytes]) -> AsyncIterator[bytes]:
-    """Cut chunks into lines.
-
-    Raises:
-        VislocError: ``server.answer`` when the last line is not complete.
-    """
+    """Cut chunks into lines."""
     rest = bytearray()
     async for chunk in chunks:
         # Not str.splitlines, which also cuts at characters that a line of JSON may contain.

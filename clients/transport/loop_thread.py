@@ -56,10 +56,6 @@ class LoopThread(Generic[C]):
         """Call the client and return what it answers; Ctrl-C cancels the call.
 
         While it waits, this thread does the blocking work of the call (``run_blocking``).
-
-        Raises:
-            RuntimeError: when the client is closed, also during the call, or when the call comes
-                from the loop's own thread, which would wait for itself.
         """
         jobs: Jobs = SimpleQueue()
 

@@ -42,11 +42,7 @@ class Upload:
 
 
 def upload_request(path: Path, map_id: str | None, version: str | None) -> Upload:
-    """Check a packed map; names that are None are read from its manifest.
-
-    Raises:
-        InvalidInput: ``map.id``, ``packed.unreadable``, or ``packed.manifest`` for another file.
-    """
+    """Check a packed map; names that are None are read from its manifest."""
     try:
         with path.open("rb") as file:
             size = os.fstat(file.fileno()).st_size
@@ -61,11 +57,7 @@ def upload_request(path: Path, map_id: str | None, version: str | None) -> Uploa
 
 
 def pieces(upload: Upload, on_progress: OnProgress) -> Generator[bytes]:
-    """Read the file.
-
-    Raises:
-        InvalidInput: ``packed.changed`` when it has become shorter meanwhile.
-    """
+    """Read the file."""
     left = upload.size_bytes
     with upload.path.open("rb") as file:
         while left:

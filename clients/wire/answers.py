@@ -70,11 +70,7 @@ class ServerInfo(Health):
 
 
 def parse_answer(server: str, parse: Callable[_P, _T], *given: _P.args, **named: _P.kwargs) -> _T:
-    """Parse an answer, and blame the server for one that cannot be.
-
-    Raises:
-        Unavailable: ``server.answer``.
-    """
+    """Parse an answer, and blame the server for one that cannot be."""
     try:
         return parse(*given, **named)
     except ValidationError as error:

@@ -22,10 +22,6 @@ def checked_options(given: LocalizeOptions | Mapping[str, Any]) -> LocalizeOptio
     """Return options that can be sent.
 
     Ranges and words are the server's to tell: a newer one knows more.
-
-    Raises:
-        InvalidInput: ``request.unknown_field``, ``request.invalid``, or ``options.NAME`` for a
-            number that cannot be sent.
     """
     options = given if isinstance(given, LocalizeOptions) else LocalizeOptions.read(dict(given))
     for name, value in options.given().items():
@@ -38,9 +34,6 @@ def options_from_texts(texts: Iterable[str]) -> LocalizeOptions:
     """Parse ``NAME=VALUE``, as the command line has them.
 
     Weights are ``NAME=NUMBER,...``, photos ``NAME,...``.
-
-    Raises:
-        InvalidInput: ``options.syntax``, ``options.NAME``, or as ``checked_options``.
     """
     values: dict[str, Any] = {}
     for text in texts:

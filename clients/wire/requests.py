@@ -141,12 +141,7 @@ def checked_search(
     *,
     ypr: bool = False,
 ) -> Search:
-    """Check what all that localizes has in common.
-
-    Raises:
-        InvalidInput: ``map.id``, ``request.map`` for no map, ``options.*``, ``priors.*`` or
-            ``request.id``.
-    """
+    """Check what all that localizes has in common."""
     if request_id is not None and not REQUEST_ID.fullmatch(request_id):
         raise refuse("request.id", field="request_id", got=request_id)
     words = _where(where)
@@ -180,23 +175,14 @@ def _where(where: Where) -> dict[str, Any]:
 def photo_request(
     search: Search, query: PhotoOrFeatures, camera: Camera | None, *, debug: bool = False
 ) -> Localize:
-    """Complete what ``localize`` was called with; a path is read here.
-
-    Raises:
-        InvalidInput: ``image.unreadable``.
-    """
+    """Complete what ``localize`` was called with; a path is read here."""
     photo = _photo(query, camera)
     words = LocalizeRequest(**search.words, **photo, debug=debug or None)
     return Localize(words, search.request_id)
 
 
 def rig_request(search: Search, rig: Rig, images: Iterable[RigImage]) -> Localize:
-    """Check and complete what ``localize_rig`` was called with; paths are read here.
-
-    Raises:
-        InvalidInput: ``request.missing_field`` or ``request.invalid`` for what is no rig or are
-            no photos, ``rig.rotation``, ``pose.translation`` or ``image.unreadable``.
-    """
+    """Check and complete what ``localize_rig`` was called with; paths are read here."""
     if rig is None:  # from callers without a type checker
         raise refuse("request.missing_field", field="rig", expected=_A_RIG)
     words = rigs.LocalizeRigRequest(**search.words, rig=_rig(rig), images=_images(images, "images"))
@@ -206,12 +192,7 @@ def rig_request(search: Search, rig: Rig, images: Iterable[RigImage]) -> Localiz
 def sequence_start(
     search: Search, rig: Rig | None, time_unit: str | None, max_gap_s: float | None
 ) -> StartSequence:
-    """Check what ``localize_sequence`` was called with.
-
-    Raises:
-        InvalidInput: ``request.invalid`` for what is no rig, ``rig.rotation``,
-            ``pose.translation``, ``sequence.time_unit`` or ``sequence.max_gap``.
-    """
+    """Check what ``localize_sequence`` was called with."""
     if max_gap_s is not None and not (math.isfinite(max_gap_s) and max_gap_s >= 0):
         raise refuse(
             "sequence.max_gap", field="max_gap_s", expected="seconds, 0 or more", got=max_gap_s
@@ -226,17 +207,7 @@ def sequence_start(
 
 
 def instant_words(instant: Instant, index: int) -> sequences.Instant:
-    """Check an instant of a sequence and read its photos.
-
-    Args:
-        instant: to send.
-        index: of it in the sequence, for errors.
-
-    Raises:
-        InvalidInput: ``pose.rotation``, ``pose.translation``, ``pose.covariance``,
-            ``request.invalid`` for another timestamp than a whole number and for what are no
-            photos, or ``image.unreadable``.
-    """
+    """Check an instant of a sequence and read its photos."""
     odometry, priors = instant.odometry, instant.priors
     images = _images(instant.images, f"instants[{index}].images")
     with inside(f"instants[{index}]"):
@@ -249,11 +220,7 @@ def instant_words(instant: Instant, index: int) -> sequences.Instant:
 
 
 def check_time_unit(time_unit: str | None, first_timestamp: int) -> None:
-    """Refuse a sequence whose unit of time is neither said nor told by its first timestamp.
-
-    Raises:
-        InvalidInput: ``sequence.time_unit``, as the server raises it.
-    """
+    """Refuse a sequence whose unit of time is neither said nor told by its first timestamp."""
     if time_unit is None and guess_time_unit([first_timestamp]) is None:
         raise refuse(
             "sequence.time_unit",
@@ -304,21 +271,13 @@ def _unusable(field: str, expected: str, got: object) -> VislocError:
 
 
 def get_map_request(map_ref: str) -> GetMap:
-    """Check the name of a map.
-
-    Raises:
-        InvalidInput: ``map.id``.
-    """
+    """Check the name of a map."""
     _check_map(map_ref)
     return GetMap(map_ref)
 
 
 def checked_version(map_id: str, version: str) -> tuple[str, str]:
-    """Check the names of a map and its version, and return them.
-
-    Raises:
-        InvalidInput: ``map.id``.
-    """
+    """Check the names of a map and its version, and return them."""
     for name, what in ((map_id, "map"), (version, "map version")):
         if not _NAME.fullmatch(name):
             raise refuse(
@@ -332,20 +291,12 @@ def checked_version(map_id: str, version: str) -> tuple[str, str]:
 
 
 def read_query(query: PhotoOrFeatures) -> bytes | MaskedImage | Features:
-    """Return what is sent of a photo.
-
-    Raises:
-        InvalidInput: ``image.unreadable``.
-    """
+    """Return what is sent of a photo."""
     return read_image(Path(query)) if isinstance(query, str | Path) else query
 
 
 def read_image(path: Path) -> bytes:
-    """Read the bytes of a photo.
-
-    Raises:
-        InvalidInput: ``image.unreadable``.
-    """
+    """Read the bytes of a photo."""
     try:
         return path.read_bytes()
     except OSError as error:
@@ -355,11 +306,7 @@ def read_image(path: Path) -> bytes:
 
 
 def checked_server(server: str) -> str:
-    """Return the address of a server, as given.
-
-    Raises:
-        InvalidInput: ``server.url``.
-    """
+    """Return the address of a server, as given."""
     match = _SERVER.fullmatch(server)
     if match is None or not 0 < int(match["port"] or 80) < 65536 or not _is_url(server):
         raise refuse("server.url", field="server", got=server)

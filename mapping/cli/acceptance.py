@@ -41,9 +41,6 @@ def require_acceptance(opened: Map, *, accept: bool, pictures: Path) -> None:
     Args:
         accept: whether the version was put into use all the same.
         pictures: folder for a picture of where the photos in question lie.
-
-    Raises:
-        Conflict: ``map.doubtful``.
     """
     doubts = opened.manifest.parts.doubts
     if not doubts:

@@ -107,12 +107,7 @@ class AnchorSettings:
     ] = None
 
     def located(self, opened: Map) -> Georeference:
-        """Return where the map lies on Earth.
-
-        Raises:
-            InvalidInput: ``anchor.source`` unless the options give the place in one way.
-            VislocError: what reading and fitting raise.
-        """
+        """Return where the map lies on Earth."""
         place = (self.latitude, self.longitude, self.altitude, self.yaw)
         has_place = any(value is not None for value in place)
         details = any(one is not None for one in (self.accuracy, self.scale, self.gravity))

@@ -26,11 +26,7 @@ _LINE_EVERY_S = 5.0
 
 
 class StageProgress:
-    """A ``mapping.progress.Progress`` that prints.
-
-    Args:
-        if_stopped: told to the user after Ctrl-C.
-    """
+    """A ``mapping.progress.Progress`` that prints."""
 
     def __init__(
         self, console: Console, if_stopped: str = "the same command resumes where it was"

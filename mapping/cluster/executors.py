@@ -30,12 +30,7 @@ class Executor(Protocol):
         """Resources that other processes have used for finished items."""
 
     def run(self, task: Callable[[T], object], items: Sequence[T], progress: ItemProgress) -> None:
-        """Do a task for every item; report progress as items are finished.
-
-        Raises:
-            Unavailable: ``build.worker_died``.
-            Exception: what the task raised first; waiting items are dropped.
-        """
+        """Do a task for every item; report progress as items are finished."""
 
     def run_here(
         self, task: Callable[[T], S], items: Sequence[T], progress: ItemProgress
@@ -44,21 +39,12 @@ class Executor(Protocol):
 
         Worker processes have loaded what networks and matching need. If there are any, this process
         need not load it too, which would take two seconds.
-
-        Raises:
-            Unavailable: ``build.worker_died``.
-            Exception: what the task raised first; waiting items are dropped.
         """
 
     def run_one(
         self, task: Callable[[T, Progress], object], item: T, stage: str, progress: Progress
     ) -> None:
-        """Do one long task. In this process it reports its stages itself; else it is one stage.
-
-        Raises:
-            Unavailable: ``build.worker_died``.
-            Exception: what the task raised.
-        """
+        """Do one long task. In this process it reports its stages itself; else it is one stage."""
 
 
 def executor_names() -> list[str]:
@@ -67,11 +53,7 @@ def executor_names() -> list[str]:
 
 
 def open_executor(name: str, workers: int, ray_address: str) -> AbstractContextManager[Executor]:
-    """Return an executor of ``executor_names()``, which ends with its ``with`` block.
-
-    Raises:
-        VislocError: what an extension refuses.
-    """
+    """Return an executor of ``executor_names()``, which ends with its ``with`` block."""
     if name == LOCAL:
         return Workers(workers)
     opened: AbstractContextManager[Executor] = load(extensions(EXECUTORS)[name])(

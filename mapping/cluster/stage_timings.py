@@ -55,7 +55,6 @@ class StageCost:
     Attributes:
         items: how many it had; None for several stages together.
         wall_s: seconds from its start to its end.
-        spent: by all processes.
     """
 
     stage: str

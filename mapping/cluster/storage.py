@@ -30,11 +30,7 @@ _RESUMES = "; finished work is kept, and the same command resumes"
 
 
 def place_of(text: str, option: str) -> Path:
-    """Return the place of a folder's name or a URL.
-
-    Raises:
-        InvalidInput: ``build.url`` for one that cannot be used.
-    """
+    """Return the place of a folder's name or a URL."""
     text = text.removeprefix("file://")
     if "://" not in text:
         return Path(text)
@@ -79,7 +75,6 @@ def storage_failed(error: Exception, place: Path) -> VislocError:
     It says that the same command resumes only where nothing but the storage must change for that.
 
     Args:
-        error: one of ``storage_errors``.
         place: of the job's work, named where the error names no file.
     """
     passes = not isinstance(error, OSError) or error.errno in _PASSING
@@ -91,11 +86,7 @@ def storage_failed(error: Exception, place: Path) -> VislocError:
 
 
 def open_store(maps_dir: Path, cache_dir: Path) -> MapStore:
-    """Return the store of a folder, or of a URL with local copies in ``cache_dir``.
-
-    Raises:
-        InvalidInput: ``build.url`` without the extension that opens URLs.
-    """
+    """Return the store of a folder, or of a URL with local copies in ``cache_dir``."""
     if not is_remote(maps_dir):
         return MapStore(maps_dir)
     try:
@@ -138,11 +129,7 @@ def scratch_folder(maps_dir: Path, cache_dir: Path, map_id: str) -> Path:
 
 @contextmanager
 def opened_dataset(place: Path) -> Iterator[Dataset]:
-    """Read a dataset; at a URL, fetch its tables and leave photos where they are.
-
-    Raises:
-        DatasetError: what ``read_dataset`` raises.
-    """
+    """Read a dataset; at a URL, fetch its tables and leave photos where they are."""
     if not is_remote(place):
         yield read_dataset(place)
         return

@@ -50,11 +50,8 @@ class Seen:
     """A photo that was localized in another frame ("there") than its own ("here").
 
     Attributes:
-        pose_here: cam_from_here.
-        camera: intrinsics.
         pixels: (n, 2) float64, keypoints of the inliers of ``pose_there``.
         points: (n, 3) float64, the landmarks of these inliers, in the other frame.
-        pose_there: cam_from_there, as it was localized.
         own_points: (n, 3) float64, the same points in the photo's own frame, from its depth; None
             without depth.
     """
@@ -72,7 +69,6 @@ class Tie:
     """How the frame of n photos lies in another one. The similarity gives each a "moved pose".
 
     Attributes:
-        there_from_here: the similarity.
         tied: (n,) whether the photo agrees with it.
         errors_px: (n,) median reprojection error of the photo's matches under its moved pose;
             infinity if they lie behind the camera.
@@ -112,7 +108,6 @@ def tie(
         back: photos of the other frame, localized in this one. The similarity must explain their
             matches too. May be empty.
         rigid: whether both frames have one unit, so that the scale is 1.
-        seed: equal seeds give equal ties.
 
     Returns:
         The tie, or why there is none: fewer than three photos; at most half of them agree; without
@@ -164,7 +159,6 @@ def other_depth(photos: Sequence[Seen], there_from_here: Similarity) -> str | No
 
     Args:
         photos: photos that agree with the similarity, at least one, all with ``own_points``.
-        there_from_here: the similarity.
     """
     return _other_depth([_View(seen, forward=True) for seen in photos], there_from_here)
 
@@ -174,7 +168,6 @@ def refined_by_depth(photos: Sequence[Seen], start: Similarity, *, rigid: bool) 
 
     Args:
         photos: photos that agree with the similarity, all with ``own_points``.
-        start: the similarity.
         rigid: whether both frames have one unit.
 
     Returns:
@@ -221,7 +214,6 @@ def refined_on_points(
     Cauchy's, in units of the median distance, so that it fits any depth sensor and any unit.
 
     Args:
-        start: near the result.
         here: (n, 3) in this frame, n >= 3.
         there: (n, 3) the same points in the other frame; some may be wrong.
         rigid: whether both frames have one unit.

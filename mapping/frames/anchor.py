@@ -91,10 +91,6 @@ def known_positions(dataset: Dataset, photos: Sequence[MappingPhoto]) -> KnownPo
 
     GNSS fixes in degrees become metres east, north and up of their middle; those in UTM are metres
     already.
-
-    Raises:
-        DatasetError: ``gnss.epsg`` for fixes in another coordinate system, or in several.
-        InvalidInput: ``anchor.position`` for degrees that are no place on Earth.
     """
     posed = [row for row, photo in enumerate(photos) if photo.cam_from_world is not None]
     fixes = {fix.timestamp: fix for fix in dataset.gnss}
@@ -152,11 +148,7 @@ def _at(origin: NDArray[np.float64]) -> Geodetic:
 
 
 def coordinate_system(dataset: Dataset, receivers: set[str]) -> str:
-    """Return the coordinate system that all of these receivers' fixes are in.
-
-    Raises:
-        DatasetError: ``gnss.epsg`` for one that is not known, or for several.
-    """
+    """Return the coordinate system that all of these receivers' fixes are in."""
     systems = {(dataset.sensors[one].params or (_EPSG_WGS84,))[0]: one for one in receivers}
     known = (*EPSG_GEODETIC, *_EPSG_UTM)
     for system, receiver in sorted(systems.items()):

@@ -35,10 +35,8 @@ def place_error(
     """Return the error of a place that was fitted to fixes; None where they leave nothing over.
 
     Args:
-        geodetic: the place.
         points: (n, 3) of the world, those that the fit rests on.
         positions: (n, 3) where they were said to be, metres east, north and up of the place.
-        fits_scale: whether the scale was fitted too.
     """
     placed = enu_of(points, geodetic)
     middle = placed.mean(axis=0)

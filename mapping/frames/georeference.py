@@ -50,10 +50,8 @@ class Correspondences:
 
     Attributes:
         kind: of the anchor that rests on them.
-        names: what each is called.
         points: (n, 3) in the map's world.
         positions: (n, 3) latitude, longitude (deg) and height (m).
-        max_error_m: those further off are mistakes.
     """
 
     kind: str
@@ -84,10 +82,6 @@ def correspondences_from_fixes(opened: Map, dataset: Dataset) -> Correspondences
 
     A photo that the dataset has under the same name is looked up at the timestamp that it has
     there.
-
-    Raises:
-        DatasetError: ``gnss.epsg`` for fixes that are not in degrees.
-        InvalidInput: ``anchor.fixes`` when no photo has one.
     """
     fixes = {fix.timestamp: fix for fix in dataset.gnss}
     times = {record.path: record.timestamp for record in dataset.images}
@@ -127,10 +121,6 @@ def read_correspondences(opened: Map, path: Path) -> Correspondences:
     """Read a CSV file of points, or of photos of the map, with their places on Earth.
 
     Its first line names the columns: x, y, z or image; latitude, longitude, altitude.
-
-    Raises:
-        InvalidInput: ``anchor.file`` with the line, or ``anchor.image`` for a photo that the map
-            does not have.
     """
     rows = _read_rows(path)
     by_image = "image" in rows[0][1]
@@ -158,12 +148,7 @@ def read_correspondences(opened: Map, path: Path) -> Correspondences:
 
 
 def georeference(opened: Map, known: Correspondences) -> Georeference:
-    """Fit the place of a map to correspondences, robustly.
-
-    Raises:
-        InvalidInput: ``anchor.undetermined`` when they do not determine it, ``anchor.scale`` when
-            they contradict a metric map, ``anchor.gravity`` when they contradict its down.
-    """
+    """Fit the place of a map to correspondences, robustly."""
     origin = middle_of(known.positions)
     local = enu_from_geodetic(known.positions, origin)
     found = align_positions(known.points, local, known.max_error_m)
@@ -203,15 +188,11 @@ def given_place(
     """Say where the map lies.
 
     Args:
-        opened: the map.
         position: latitude, longitude (deg) and height (m) of the world's (0, 0, 0).
         yaw_deg: direction of the level part of the world's x axis: 0 east, 90 north.
         accuracy: how far off the map may be, metres (rms); None when that is not known.
         scale: metres per unit of the world; for maps that are not metric.
         gravity: what points down in the world, of any length; for maps that do not know it.
-
-    Raises:
-        InvalidInput: ``anchor.position``, ``anchor.yaw``, ``anchor.scale``, ``anchor.gravity``.
     """
     check_on_earth(np.array([position]), "--latitude, --longitude, --altitude")
     world = opened.manifest.world
@@ -250,12 +231,7 @@ def given_place(
 
 
 def publish_anchored(opened: Map, found: Georeference, maps_dir: Path, *, force: bool) -> Path:
-    """Publish a map with its place on Earth as a new version, and make it current.
-
-    Raises:
-        Conflict: ``map.anchored`` without ``force``, when it has a place already; ``map.outdated``
-            when another version is current; ``build.running``.
-    """
+    """Publish a map with its place on Earth as a new version, and make it current."""
     if opened.geodetic is not None and not force:
         raise refuse("map.anchored", field="MAP", ref=opened.ref)
     map_id, based_on = opened.manifest.id, opened.manifest.version

@@ -31,11 +31,7 @@ class KnownLength:
 
 
 def metres_in(text: str, field: str) -> float:
-    """Read ``3.2m``, ``320 cm`` or ``3.2``, metres.
-
-    Raises:
-        InvalidInput: ``capture.length``.
-    """
+    """Read ``3.2m``, ``320 cm`` or ``3.2``, metres."""
     found = _LENGTH.fullmatch(text.strip())
     metres = float(found[1]) * _METRES[(found[2] or "m").lower()] if found else 0.0
     if not 0 < metres <= _LONGEST_M:
@@ -50,11 +46,7 @@ def known_length(given: tuple[str, str, str]) -> KnownLength:
 
 
 def photo_named(text: str, names: Collection[str]) -> str:
-    """Return the photo of this name, or the only one whose name ends so.
-
-    Raises:
-        InvalidInput: ``capture.photo``.
-    """
+    """Return the photo of this name, or the only one whose name ends so."""
     if text in names:
         return text
     ends = [one for one in names if one.endswith(f"/{text}")]
@@ -74,7 +66,6 @@ class Scale:
     Attributes:
         metres: per unit; None when it could not be told.
         note: where it is from, or why there is none.
-        record: for the manifest.
     """
 
     metres: float | None

@@ -31,7 +31,6 @@ class Plan:
         pitch_deg: how far the photo looks below the level.
         quarter_turns: of the camera about its axis, clockwise as seen from behind: 1 or 3 where
             the mapping photos are stored lying on their side.
-        camera: of the photo.
     """
 
     up: NDArray[np.float64]

@@ -33,10 +33,7 @@ def match_stored(
     """Match the features that a map keeps of a photo with what photos of a map see.
 
     Args:
-        source: the map that keeps the photo.
-        image: its row there.
         target: of the map that is asked; may be the same.
-        photos: rows of its photos, most similar first.
         without: (k,) landmarks that it is not to have; None for none.
         features: (m,) rows of the photo's features that count; None for all.
     """
@@ -67,10 +64,6 @@ def solve_stored(
     """Find the pose of a photo from its matches, relative to the origin of the map asked.
 
     Args:
-        source: the map that keeps the photo.
-        image: its row there.
-        geometry: of the map that is asked.
-        matched: what ``match_stored`` found.
         options: thresholds and the seed.
     """
     pixels = source.keypoints(image)[matched.keypoints].astype(np.float64)

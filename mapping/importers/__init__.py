@@ -59,13 +59,9 @@ class ImportSummary:
     """The result of an import.
 
     Attributes:
-        images: photos.
-        posed: photos with a pose.
         cameras: cameras, those of unknown intrinsics included.
-        depth_maps: depth maps.
         depth_scale: units of the world in one unit of the depth maps.
         masks: masks of photos, in the folder ``MASKS`` of the dataset.
-        gnss: GNSS fixes.
         points: 3D points.
         observations: keypoints that see a point.
         keypoints_type: folder name of the keypoints; None without.
@@ -98,13 +94,7 @@ def imported(
     photos: Path | None,
     progress: Progress = _untold,
 ) -> Iterator[tuple[Path, ImportSummary]]:
-    """Have a foreign reconstruction as a dataset while a map is made of it.
-
-    Raises:
-        InvalidInput: ``map.id``.
-        InvalidInput, DatasetError: as ``import_dataset``.
-        Conflict: ``build.running``.
-    """
+    """Have a foreign reconstruction as a dataset while a map is made of it."""
     MapStore(maps_dir).versions(map_id)  # refuses what is not an id
     # Ids begin with a letter or digit: no work folder of a build has this name.
     dataset = maps_dir / ".work" / f".imported-{map_id}"
@@ -123,15 +113,9 @@ def read_model(
     """Read a foreign reconstruction.
 
     Args:
-        name: one of ``importer_names``.
         path: the file or folder that the format consists of.
         photos: the folder that names of photos are relative to; None takes the usual place.
         progress: told the stage, how much of it is done, and how much there is.
-
-    Raises:
-        InvalidInput: ``import.unknown_format``, ``import.photos``.
-        DatasetError: ``import.*`` or ``camera.*``, with the file, and the line or image, that is
-            wrong.
     """
     if name not in importer_names():
         raise refuse("import.unknown_format", field="FORMAT", expected=importer_names(), got=name)
@@ -160,15 +144,10 @@ def import_dataset(
     """Read a foreign reconstruction and write it as a kapture 1.1 dataset.
 
     Args:
-        name: one of ``importer_names``.
         path: the file or folder that the format consists of.
         output: the dataset to make; it must not exist, and does not if this fails.
         photos: the folder that names of photos are relative to; None takes the usual place.
         progress: told the stage, how much of it is done, and how much there is.
-
-    Raises:
-        Conflict: ``import.exists``.
-        InvalidInput, DatasetError: as ``read_model`` and ``write_imported``.
     """
     refuse_existing(output, "import.exists")  # before the long work
     model = read_model(name, path, photos, progress)

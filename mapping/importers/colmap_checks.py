@@ -49,7 +49,6 @@ def check_model(folder: Path, copy: Path) -> dict[int, str] | None:
     """Check the files of a model that pycolmap would read: the binary ones, else the text.
 
     Args:
-        folder: with the model.
         copy: an existing folder that gets a text model as it was read, with ids for names.
 
     Returns:

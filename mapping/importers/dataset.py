@@ -51,14 +51,6 @@ def write_imported(model: ImportedModel, output: Path) -> tuple[str, ...]:
 
     Returns:
         The model's notes, and those on files that are missing or left out.
-
-    Raises:
-        Conflict: ``import.exists``.
-        DatasetError: ``import.empty``, ``import.name``, ``import.duplicate_image``,
-            ``import.duplicate_record``, ``import.sensor``, ``import.features``,
-            ``import.points``, ``import.observations``; ``import.photos_missing`` if no photo has
-            its file and the model lacks descriptors, which would have to be made of photos;
-            ``import.photo``, ``import.photo_size`` for a photo that is not of its camera's size.
     """
     _check_images(model)
     _check_features(model)

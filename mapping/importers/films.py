@@ -66,12 +66,7 @@ def is_live_photo(path: Path, stems: Set[str]) -> bool:
 
 @contextmanager
 def opened_film(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
-    """Open a film, and give the track to read.
-
-    Raises:
-        InvalidInput: ``capture.video`` for what is no video, has no video track or is damaged.
-        TooLarge: ``capture.video_size``.
-    """
+    """Open a film, and give the track to read."""
     with path.open("rb") as file:
         kind = file_kind(file.read(HEAD_BYTES))
         file.seek(0)

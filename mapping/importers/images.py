@@ -108,12 +108,6 @@ def read(
     Linked folders, and links out of the folder, are not followed. Photos of the same maker, model,
     focal length and size share a camera: SIMPLE_RADIAL if EXIF gives the focal length, else of
     unknown intrinsics. ``left_out`` of the model lists unused files with the reason.
-
-    Raises:
-        InvalidInput: ``import.photos`` if ``photos`` is given; ``import.folder`` for a file;
-            ``import.scan`` if it holds the scan of an app.
-        NotFound: ``import.missing`` if there is no such folder.
-        DatasetError: ``import.empty`` if it holds no readable photo.
     """
     if photos is not None:
         raise refuse(
@@ -399,9 +393,6 @@ def _degrees(value: object, letter: object, signs: Mapping[str, int], limit: flo
     """Return degrees of degrees, minutes, seconds and the letter of the hemisphere.
 
     Numbers at the end that are not there or 0/0 are 0: the one before them has decimals then.
-
-    Raises:
-        ValueError: why there are none.
     """
     letter = letter.decode("latin-1") if isinstance(letter, bytes) else letter
     sign = signs.get(exif_text(letter).upper())

@@ -12,7 +12,6 @@ class ModelSize:
 
     Attributes:
         name: what the note calls it.
-        photos: with a pose.
         points: 3D points.
     """
 

@@ -22,7 +22,6 @@ class ImportedImage:
 
     Attributes:
         name: path relative to the folder of photos, with forward slashes.
-        sensor: id of its camera.
         timestamp: unique per camera; the photo's rank where the format has none.
         cam_from_world: pose; None when it was not reconstructed.
         keypoints: (n, 2 or more) float32 x, y, ... in pixels, top-left centre at (0.5, 0.5); None
@@ -49,13 +48,11 @@ class ImportedModel:
     Attributes:
         sensors: cameras by id, and the GNSS receiver or depth sensors if there are any. A camera
             whose intrinsics are unknown is an UNKNOWN_CAMERA (``Sensor.camera`` is None).
-        images: the photos.
         photos: folder that their names are relative to; None when the model comes without photos.
         points: (P, 3) float64 in the world; P = 0 without points.
         colors: (P, 3) uint8.
         observations: (M, 3) int64 rows: point, image, row of that image's keypoints.
         keypoints_type: folder name for the keypoints, such as ``sift``.
-        gnss: fixes.
         metric: whether a unit of the world is known to be a metre.
         depth_scale: units of the world in one unit of the depth maps.
         notes: what was left out or assumed, one sentence each.

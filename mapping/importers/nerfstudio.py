@@ -71,7 +71,6 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
     are in metres by definition, and the file does not say that positions were scaled.
 
     Args:
-        path: the file, or the folder that holds it.
         photos: folder that ``file_path`` is relative to; None takes that of the file.
     """
     file = path / _FILE if path.is_dir() else path
@@ -79,11 +78,7 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
 
 
 def read_recording(top: JsonValue, folder: Path) -> ImportedModel:
-    """Read the content of a ``transforms.json``, as ``read``.
-
-    Args:
-        folder: the folder that holds the photos.
-    """
+    """Read the content of a ``transforms.json``, as ``read``."""
     file = top.file
     frames = top["frames"].elements()
     paths = [frame["file_path"] for frame in frames]

@@ -22,10 +22,6 @@ def importer_of(path: Path) -> str | None:
 
 
 def refuse_recognized(path: Path) -> None:
-    """Refuse what an extension recognises where photos or a dataset are expected.
-
-    Raises:
-        InvalidInput: ``import.scan``.
-    """
+    """Refuse what an extension recognises where photos or a dataset are expected."""
     if (app := importer_of(path)) is not None:
         raise refuse("import.scan", field=str(path), app=app, path=path)

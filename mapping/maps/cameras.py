@@ -35,10 +35,8 @@ class MapCamera:
     """A camera of a map.
 
     Attributes:
-        model: camera model.
         width: of its photos, pixels.
         height: of its photos, pixels.
-        focal_length_px: in the map.
         source: where it came from: EXIF, the dataset, the photos alone; unknown in maps that do not
             tell.
         moved_percent: by how much refinement moved it from there; None if it came from the photos
@@ -97,7 +95,6 @@ def origins_record(a: Map, b: Map, images: Sequence[ImageRecord]) -> dict[str, J
     """Return what the manifest of a joined map says of its cameras.
 
     Args:
-        a: the first map, whose cameras keep their names.
         b: the second one.
         images: of the joined map: those of ``a``, then those of ``b``.
     """

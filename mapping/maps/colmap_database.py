@@ -81,7 +81,6 @@ def write_colmap_database(
 
     Args:
         path: a file that does not exist.
-        photos: the photos.
         first_cameras: the sensors that are counted before those of other photos.
         matches: (k, 2) rows of keypoints by rows of two photos, the lower one first; all count as
             verified.

@@ -28,8 +28,6 @@ def match_queries(
     retrieved photo that sees it.
 
     Args:
-        opened: the map.
-        localizer: of the map.
         queries: their poses are not used; of ``usable_queries``, the others are left out.
 
     Returns:

@@ -101,7 +101,6 @@ def selected(
     Cameras and rigs stay, since queries may come from any of them.
 
     Args:
-        content: the map.
         images: (n,) photos to keep; None for all.
         landmarks: (P,) landmarks to keep; None for all.
         observations: (M,) observations to keep; None for all.
@@ -154,8 +153,6 @@ def moved(content: MapContent, new_from_old: Similarity, *, metric: bool) -> Map
     """Return a map in another frame.
 
     Args:
-        content: the map.
-        new_from_old: takes its world to the other one.
         metric: whether a unit of the other world is a metre.
     """
     old, turn = (
@@ -196,14 +193,9 @@ def joined(a: MapContent, b: MapContent, same: NDArray[np.int64] | None = None) 
     are stored in the steps of ``a``. What a world and a method are called is taken from ``a``.
 
     Args:
-        a: a map.
         b: another one.
         same: (P_b,) for each landmark of ``b`` the row of the landmark of ``a`` that it is, or
             -1 if it is none of them; None if all are new.
-
-    Raises:
-        Conflict: ``merge.photos`` when both have photos of one name, ``merge.features`` when
-            their local features differ, ``merge.landmarks`` when one alone has landmarks.
     """
     refuse_other_features(a, b)
     if bool(len(a.landmarks.points)) != bool(len(b.landmarks.points)):

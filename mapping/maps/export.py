@@ -70,7 +70,6 @@ def export_map(
     reconstruction is exported: its points and their observations, not the landmarks made since.
 
     Args:
-        opened: the map.
         output: a folder to make, for ``ply`` a file; it must not exist.
         format_name: a key of ``EXPORTERS``: ``colmap`` is a binary model of one rig per camera,
             with ``database.db`` in the schema of COLMAP 3.8;
@@ -80,13 +79,6 @@ def export_map(
 
     Returns:
         Notes on what is not as in the map, one sentence each.
-
-    Raises:
-        InvalidInput: ``export.unknown_format``; ``export.queries`` for another format, or for a map
-            of an imported reconstruction whose points are not those that queries are matched with;
-            ``export.no_queries`` when no photo can be added.
-        Conflict: ``export.exists``; ``map.no_landmarks``.
-        DatasetError: ``kapture.field`` for a name that kapture cannot hold.
     """
     export = EXPORTERS.get(format_name)
     if export is None:

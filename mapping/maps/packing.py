@@ -16,12 +16,7 @@ def write_packed(folder: Path, output: Path) -> AnyManifest:
     """Pack a map or a set, every byte of which is checked first.
 
     Args:
-        folder: the map.
         output: the file, which must not exist; it appears when it is complete.
-
-    Raises:
-        Conflict: ``pack.output_exists``.
-        MapCorrupt: when the map is not what its manifest says.
     """
     refuse_existing(output, _EXISTS)  # before the long part
     verify_any(folder)

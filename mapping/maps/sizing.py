@@ -41,11 +41,6 @@ def publish_sized(
     Args:
         force: measure a map anew that is in metres already.
         accept: put the version into use whatever speaks against it.
-
-    Raises:
-        InvalidInput: ``capture.photo``; ``edit.scale`` when the length tells no scale, or not the
-            one that the map's place on Earth tells.
-        Conflict: ``edit.metric`` without ``force``; ``map.outdated``; ``build.running``.
     """
     manifest, geodetic = opened.manifest, opened.geodetic
     if manifest.world.metric and not force:

@@ -19,10 +19,6 @@ def upgrade_map(opened: Map, maps_dir: Path) -> Path:
 
     Returns:
         The folder of the new version.
-
-    Raises:
-        Conflict: ``map.upgraded`` when there is nothing to add; ``map.outdated`` when another
-            version is in use; ``build.running``.
     """
     test = opened.manifest.parts.own_test
     had_one = any(record.clusters is not None for record in opened.manifest.global_features)

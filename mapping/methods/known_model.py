@@ -48,15 +48,9 @@ def landmarks_from_reconstruction(
     observations is applied, since the tool that made them had its own.
 
     Args:
-        photos: with poses.
         origin: of the coordinates of the dataset's keypoints.
         settings: for matching again; the pairs are those that share points.
         metric: whether a unit of the dataset's poses is a metre.
-
-    Raises:
-        DatasetError: ``model.no_points``, ``kapture.index`` for an observation by a keypoint that
-            does not exist, and what reading raises.
-        InvalidInput: what matching raises.
     """
     known = read_reconstruction(dataset.root)
     if known is None or known.keypoints_type is None or len(known.observations) == 0:
@@ -106,11 +100,7 @@ def _landmarks_of(
 
 
 def refuse_without_points(dataset: Dataset) -> None:
-    """Refuse a dataset without the files of a reconstruction.
-
-    Raises:
-        DatasetError: ``model.no_points``.
-    """
+    """Refuse a dataset without the files of a reconstruction."""
     folder = dataset.root / "reconstruction"
     if not all((folder / name).is_file() for name in ("points3d.txt", "observations.txt")):
         raise _no_points(dataset)

@@ -51,9 +51,6 @@ def make_model(
     """Triangulate the matches, or find poses with them, as the settings say.
 
     ``matches_key`` stands for the matches in the key of the model.
-
-    Raises:
-        InvalidInput: ``sfm.*``.
     """
     inputs = _Inputs.of(context, photos, matches, settings)
     key = _model_key(matches_key, photos, rigs, settings)

@@ -27,8 +27,6 @@ def models_beside(
 
     Args:
         largest: of n photos; None among its views stands for a photo without a place.
-        matches: between the n photos, verified.
-        make: raises InvalidInput when the photos make no model.
 
     Returns:
         Models of the n photos, each of at least ``MIN_PHOTOS``, the largest first.

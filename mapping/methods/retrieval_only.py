@@ -24,11 +24,7 @@ def no_landmarks(
     """Keep all local features of the photos, for queries to match and triangulate.
 
     Args:
-        photos: with poses.
         metric: whether a unit of the dataset's poses is a metre.
-
-    Raises:
-        InvalidInput: ``retrieval_only.no_keypoints`` when no photo has a keypoint.
     """
     keypoints = [context.features.read(photo).keypoints for photo in photos]
     if not any(map(len, keypoints)):
@@ -46,10 +42,6 @@ def no_landmarks(
 
 
 def refuse_without_landmarks(opened: Map) -> None:
-    """Refuse what needs the landmarks of a map, which one of this method does not have.
-
-    Raises:
-        Conflict: ``map.no_landmarks``.
-    """
+    """Refuse what needs the landmarks of a map, which one of this method does not have."""
     if not opened.has_landmarks:
         raise refuse("map.no_landmarks", field="MAP", ref=opened.ref)

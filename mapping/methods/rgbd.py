@@ -90,10 +90,6 @@ def landmarks_from_depth(
         settings: the voxel size is in the unit of the world.
         metric: whether a unit of the world is a metre.
         world_from_dataset: None if the dataset's frame is the world.
-
-    Raises:
-        DatasetError: what ``lift_keypoints`` raises.
-        InvalidInput: what ``leave_out_far`` and ``merge_landmarks`` raise.
     """
     work = context.work
     task = _LiftTask(work, dataset.without_records(), context.features, settings.depth_scale)
@@ -122,11 +118,7 @@ def landmarks_from_depth(
 
 
 def refuse_without_depth(dataset: Dataset, photos: Sequence[MappingPhoto]) -> None:
-    """Refuse photos of which none has a depth map.
-
-    Raises:
-        DatasetError: ``dataset.no_depth``.
-    """
+    """Refuse photos of which none has a depth map."""
     if all(photo.depth is None for photo in photos):
         raise refuse("dataset.no_depth", field=str(dataset.root / "sensors" / "records_depth.txt"))
 
@@ -167,11 +159,7 @@ class _LiftTask:
 def lift_keypoints(
     dataset: Dataset, photo: MappingPhoto, keypoints: NDArray[np.float32], depth_scale: float
 ) -> LiftedKeypoints:
-    """Lift the keypoints (n, 2) of a photo that have a depth into the world.
-
-    Raises:
-        DatasetError: when the depth map does not fit its sensor.
-    """
+    """Lift the keypoints (n, 2) of a photo that have a depth into the world."""
     if photo.depth is None:
         rows = np.empty(0, dtype=np.int64)
         return LiftedKeypoints(rows, keypoints[rows], np.empty((0, 3)))
@@ -191,9 +179,6 @@ def leave_out_far(
 
     Returns:
         The median depth of all in the unit of the photos' poses, and a note on those left out.
-
-    Raises:
-        InvalidInput: ``rgbd.no_landmarks``.
     """
     depths = [
         photo.pose.apply(one.points)[:, 2].astype(np.float32)
@@ -232,15 +217,10 @@ def merge_landmarks(
     stays. It takes about 150 bytes of memory per keypoint.
 
     Args:
-        photos: n photos.
-        lifted: n, the lifted keypoints of each photo.
         voxel_size: edge of a voxel in the unit of the world.
 
     Returns:
         The landmarks, and for each photo the rows of its features that observe them.
-
-    Raises:
-        InvalidInput: ``rgbd.voxel_size``.
     """
     points_of, pixels_of, rows_of = zip(
         *((one.points, one.pixels, one.rows) for one in lifted), strict=True

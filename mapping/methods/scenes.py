@@ -17,12 +17,7 @@ from visloc.kapture.matches import open_matches
 
 
 def find_pairs(scene: Scene, settings: SfmSettings) -> Pairs:
-    """Return the pairs of the pairs file, of the given matches, or else of the pairings.
-
-    Raises:
-        InvalidInput: ``pairs.none``, and what the pairings raise.
-        DatasetError: what ``read_pairs`` and ``open_matches`` raise.
-    """
+    """Return the pairs of the pairs file, of the given matches, or else of the pairings."""
     if settings.pairs_file is not None:
         pairs = read_pairs(settings.pairs_file, scene)
     elif settings.matches_dir is not None:

@@ -80,17 +80,11 @@ def landmarks_from_matches(
     """Pair, match and verify the photos, and make landmarks of the matches.
 
     Args:
-        photos: with poses, unless the settings estimate them.
-        global_features: for the pairing retrieval.
         metric: whether a unit of the dataset's poses is a metre.
 
     Returns:
         The landmarks of each piece that photos fall apart into while their poses are estimated, the
         largest first; one piece of photos with poses.
-
-    Raises:
-        InvalidInput: ``pairs.*``, ``sfm.*``.
-        DatasetError: with the file that is wrong.
     """
     config = MAPPER_CONFIGS[settings.mapper]
     if settings.matches_dir is not None:

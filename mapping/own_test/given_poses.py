@@ -70,7 +70,6 @@ class _Pair:
 
     Attributes:
         b_from_a: pose of the second camera in the first one's frame, one unit away.
-        parallax_deg: median angle between matched rays.
         pixels: (k, 2) of matches in the first photo.
         distances: (k,) their depth in the first photo, in distances between the cameras.
         rays: (n, 3) of all matches that fit, in the first camera and in the second.
@@ -107,8 +106,6 @@ def doubts_about_given(
     """Return what matches say against the given poses, or else against the depth maps.
 
     Args:
-        photos: n, with poses.
-        global_features: of these photos; they choose the pairs.
         depth_scale: metres per unit of PNG depth maps; None where depth is not used.
     """
     written = [_written(dataset, photo) for photo in photos]

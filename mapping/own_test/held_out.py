@@ -162,7 +162,6 @@ def match_held_out(
 
     Args:
         geometry: of the map; of one without landmarks, ``MapGeometry.without`` these photos.
-        image: row of the photo.
         left_out: (k,) rows of the photos that the map is not to have.
         options: how many photos are asked.
         features: (m,) rows of the photo's features that count; None for all.
@@ -234,7 +233,6 @@ def doubts_of_length(
     """Return a doubt about a map whose size rests on photos that do not come back.
 
     Args:
-        opened: the map.
         measured: names of the photos of the known length; those that are not in the map do not
             count, as they gave it no size.
         astray: photos that are known to lie away from where they were taken.

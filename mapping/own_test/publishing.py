@@ -45,13 +45,9 @@ def publish_edited(
         based_on: the version that the content was made from, if it is one of the same map.
         accept: make it current all the same.
         carried: doubts about the map that the content was made from.
-        progress: as of ``write_content``.
 
     Returns:
         The folder of the new version.
-
-    Raises:
-        Conflict: ``map.outdated`` when ``based_on`` is no longer the version in use.
     """
     if photos and len(photos) != len(content.images):
         raise AssertionError(f"{len(photos)} pictures of {len(content.images)} photos")
@@ -89,9 +85,6 @@ def refuse_not_accepted(store: MapStore, opened: Map) -> None:
 
     The result could pass its own test and be put into use, because that test cannot find all
     doubts: photos that found no place, for one, are not in the version any more.
-
-    Raises:
-        Conflict: ``map.doubtful``.
     """
     map_id, version = opened.manifest.id, opened.manifest.version
     if not opened.manifest.parts.doubts:
@@ -117,8 +110,6 @@ def write_content(
     What the content knows of the map it was made from is learned anew.
 
     Args:
-        left_out: photos that found no place, as for ``doubts_about``.
-        examine: finds more doubts.
         carried: doubts about the map that the content was made from. Those that only its build
             could find are kept.
         progress: of the stages "archive" and "own test".

@@ -51,7 +51,6 @@ class Trial:
     Attributes:
         error: (6,) rotation (rad) then centre, in the camera's axes, estimated minus true.
         photo_covariance: (6, 6) of it, as far as the photo's own measurements tell.
-        score: what spoke for the pose.
     """
 
     error: NDArray[np.float64]
@@ -113,8 +112,6 @@ def learned(trials: Sequence[Trial], tested: int, reach: float, *, independent: 
     place and counts as wrong. The factors are learned from the others.
 
     Args:
-        trials: photos that were localized.
-        tested: photos that were tried.
         reach: how far the map's photos see, units of the world.
         independent: whether the photos' poses came from elsewhere than the map's landmarks.
     """

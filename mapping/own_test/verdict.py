@@ -37,7 +37,6 @@ def doubts_about(opened: Map, run: OwnTestRun, left_out: Sequence[str] = ()) -> 
     """Return what speaks against using a map: nothing for one that passed.
 
     Args:
-        opened: the map.
         run: its own test.
         left_out: names of photos that found no place while poses were estimated.
     """

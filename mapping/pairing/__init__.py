@@ -39,13 +39,8 @@ def pair_photos(scene: Scene, names: Sequence[str], settings: PairSettings) -> P
     several, the score of a pair is the number of pairings that found it.
 
     Args:
-        scene: the photos.
         names: keys of ``PAIRINGS``; one that is named twice runs once.
         settings: for all of them; each keeps the best ``top_k`` pairs of every photo.
-
-    Raises:
-        InvalidInput: ``pairs.unknown`` for a name that is no pairing, or none at all;
-            what the pairings raise when the scene lacks what they need.
     """
     distinct = list(dict.fromkeys(names))
     unknown = [name for name in distinct if name not in PAIRINGS]

@@ -21,9 +21,6 @@ def pair_by_covisibility(scene: Scene, settings: PairSettings) -> Pairs:
 
     The score is the number of points that both see. Points seen by two photos count like all
     others; a photo that sees a point twice counts once.
-
-    Raises:
-        InvalidInput: ``pairs.no_tracks``.
     """
     if len(scene.tracks) == 0:
         raise refuse("pairs.no_tracks", field="--pairs", expected="photos that see known 3D points")

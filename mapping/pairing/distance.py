@@ -42,9 +42,6 @@ def pair_by_distance(scene: Scene, settings: PairSettings) -> Pairs:
     Photos without a pose get no pair. Two photos from the same place, which differ by a rotation
     only, still pair with a high score; their matches are lost, since given poses confirm none
     without a baseline (``visloc.matching.verification.epipolar_errors``).
-
-    Raises:
-        InvalidInput: ``pairs.no_poses``.
     """
     posed = posed_photos(scene, "distance")
     found = unite(_search(posed, settings))

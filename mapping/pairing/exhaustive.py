@@ -13,11 +13,7 @@ MAX_PHOTOS = 5000
 
 
 def pair_exhaustively(scene: Scene, settings: PairSettings) -> Pairs:  # noqa: ARG001
-    """Pair all photos, whatever ``top_k`` is; every pair scores 1.
-
-    Raises:
-        TooLarge: ``pairs.too_many_photos`` beyond ``MAX_PHOTOS``.
-    """
+    """Pair all photos, whatever ``top_k`` is; every pair scores 1."""
     num_photos = len(scene.names)
     if num_photos > MAX_PHOTOS:
         raise refuse(

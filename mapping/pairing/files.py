@@ -29,10 +29,6 @@ def read_pairs(path: Path, scene: Scene) -> Pairs:
     """Read kapture's or hloc's pairs; a pair without a score has score 1.
 
     A repeated pair, in either order, counts once with its best score.
-
-    Raises:
-        DatasetError: with file and line; ``pairs.unknown_photo``, ``pairs.same_photo``, and as
-            ``read_pair_rows``.
     """
     row_of = {name: row for row, name in enumerate(scene.names)}
     first, second, scores = array("q"), array("q"), array("d")

@@ -80,10 +80,6 @@ def pair_by_frustum(scene: Scene, settings: PairSettings) -> Pairs:
     Photos without a pose or without intrinsics get no pair. Photos from the very same place pair
     all the same; their matches are lost, since without a baseline given poses confirm none
     (``visloc.matching.verification.epipolar_errors``).
-
-    Raises:
-        InvalidInput: ``pairs.no_poses``, ``pairs.no_cameras``, or ``pairs.camera`` for a camera
-            whose distortion cannot be undone anywhere.
     """
     posed = posed_photos(scene, "frustum", with_camera=True)
     views = _views(posed, scene)

@@ -28,11 +28,7 @@ class PosedPhotos:
 
 
 def posed_photos(scene: Scene, pairing: str, *, with_camera: bool = False) -> PosedPhotos:
-    """Collect the photos with a pose and, on request, with intrinsics.
-
-    Raises:
-        InvalidInput: ``pairs.no_poses`` or ``pairs.no_cameras`` when fewer than two are left.
-    """
+    """Collect the photos with a pose and, on request, with intrinsics."""
     posed = {row: pose for row, pose in enumerate(scene.cam_from_world) if pose is not None}
     if len(posed) < 2:
         raise refuse("pairs.no_poses", field="--pairs", got=len(posed), pairing=pairing)

@@ -38,7 +38,6 @@ def best_of_rows(photos: NDArray[np.int64], scores: NDArray[np.float64], top_k: 
     Args:
         photos: (b,) rows of the scene.
         scores: (b, n) of each with every photo of the scene; minus infinity for none.
-        top_k: how many to keep of each.
     """
     last = max(scores.shape[1] - top_k, 0)
     lowest = np.partition(scores, last, axis=1)[:, last, np.newaxis]

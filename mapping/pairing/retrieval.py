@@ -24,10 +24,6 @@ def pair_by_retrieval(scene: Scene, settings: PairSettings) -> Pairs:
     The score is the cosine similarity with one global descriptor, and its generalized harmonic
     mean (``visloc.retrieval.fusion.gharm``) with several. Every photo gets its pairs, however low
     their scores: the similarity that indicates a shared view differs between descriptors.
-
-    Raises:
-        InvalidInput: ``pairs.no_global_descriptors``, or ``pairs.global_descriptor`` for one with
-            numbers that are not finite.
     """
     if not scene.global_descriptors:
         raise refuse("pairs.no_global_descriptors", field="--pairs")

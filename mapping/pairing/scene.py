@@ -16,7 +16,6 @@ class Scene:
     """The photos to pair, with all data for pairings.
 
     Attributes:
-        names: of n photos; unique.
         sensors: id of each photo's camera.
         timestamps: (n,) int64, in the dataset's unit.
         global_descriptors: (n, D) float32 unit rows by name; empty if no pairing needs them.

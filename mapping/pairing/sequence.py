@@ -18,9 +18,6 @@ def pair_by_sequence(scene: Scene, settings: PairSettings) -> Pairs:
     either side, one at an end all of them on one side. Only the order counts, not the elapsed time,
     because the unit of timestamps is unknown here. Breaks in the sequence are therefore bridged,
     which costs some matching and no accuracy. Different cameras are not paired.
-
-    Raises:
-        InvalidInput: ``pairs.no_sequence`` when no camera took two photos.
     """
     sensors = np.unique(np.array(scene.sensors), return_inverse=True)[1]
     order = np.lexsort((scene.timestamps, sensors))  # stable: equal times stay in rows' order

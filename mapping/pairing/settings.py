@@ -17,12 +17,7 @@ _option = partial(typer.Option, rich_help_panel=SFM_PANEL)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PairSettings:
-    """Limits of the pairings, checked when made. Lengths are in the unit of the world.
-
-    Raises:
-        InvalidInput: ``pairs.top_k``, ``pairs.max_distance``, ``pairs.max_angle``, ``pairs.near``
-            or ``pairs.far``, with the option of the command line as field.
-    """
+    """Limits of the pairings, checked when made. Lengths are in the unit of the world."""
 
     top_k: Annotated[int, _option(min=1, help="Best pairs to keep per photo and pairing.")] = 20
     max_distance: Annotated[

@@ -84,19 +84,12 @@ def build_map(
     before stays current until the new one is complete and verified.
 
     Args:
-        settings: what is built, from what, and how.
         progress: is called with each stage and how much of it is done.
         costs: gathers the seconds and the memory of each stage.
-        finish: changes the landmarks before they become a map.
         examine: returns doubts about the map beyond those of its own test.
 
     Returns:
         The folder of the new version, of the largest piece; for maps at a URL, of the local copy.
-
-    Raises:
-        Conflict: ``map.exists`` without ``force``; ``build.running``.
-        DatasetError, WeightsError, InvalidInput: with the file or the setting that is wrong.
-        Unavailable: ``storage.failed`` when the disk is full or broken; what executors raise.
     """
     if settings.executor != LOCAL and settings.inference is Inference.AUTO:
         # Chosen for this machine; otherwise each machine of a cluster would choose for itself.
@@ -133,11 +126,7 @@ def build_map(
 
 
 def refuse_existing_map(map_id: str, store: MapStore, *, force: bool) -> None:
-    """Refuse to build a map that exists, unless a new version is wanted.
-
-    Raises:
-        Conflict: ``map.exists``.
-    """
+    """Refuse to build a map that exists, unless a new version is wanted."""
     versions = store.versions(map_id)
     # A build that was killed while it published leaves versions of which none is current.
     if versions and map_id in store.ids() and not force:

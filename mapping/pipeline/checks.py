@@ -30,12 +30,7 @@ _MIN_LENGTH = 1e-6
 
 
 def check_settings(settings: BuildSettings) -> None:
-    """Refuse settings that would fail after hours, or give a useless map.
-
-    Raises:
-        InvalidInput: ``build.*``, with the option that is wrong.
-        WeightsError: for a global descriptor whose weights are missing.
-    """
+    """Refuse settings that would fail after hours, or give a useless map."""
     if settings.method not in METHODS:
         raise refuse("build.method", field="--method", expected=METHODS, got=settings.method)
     check_names("--executor", (settings.executor,), executor_names())
@@ -51,11 +46,7 @@ def check_settings(settings: BuildSettings) -> None:
 
 
 def check_names(option: str, names: Sequence[str], known: Sequence[str]) -> None:
-    """Refuse unknown names, and names that are given twice.
-
-    Raises:
-        InvalidInput: ``build.*``, by the option.
-    """
+    """Refuse unknown names, and names that are given twice."""
     unknown = [name for name in names if name not in known]
     if unknown or len(set(names)) < len(names):
         raise refuse(
@@ -165,9 +156,6 @@ def refuse_early(settings: BuildSettings, dataset: Dataset, photos: Sequence[Map
     """Refuse photos without depth, points, positions or pairs, if that is known already.
 
     Pairing twice takes seconds; finding features first would take hours.
-
-    Raises:
-        DatasetError, InvalidInput: what the method itself would raise later.
     """
     if settings.method == "rgbd":
         refuse_without_depth(dataset, photos)

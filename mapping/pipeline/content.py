@@ -69,12 +69,7 @@ def photo_content(
     features: LocalFeaturesSource,
     made: MadeLandmarks,
 ) -> dict[str, Any]:
-    """Return the fields of ``MapContent`` about photos, cameras and landmarks.
-
-    Args:
-        photos: n photos that the landmarks were made of.
-        names: n names of these photos in the map.
-    """
+    """Return the fields of ``MapContent`` about photos, cameras and landmarks."""
     placed = [photos[row] for row in made.photos]
     features = features.outside(made.fixed)
 

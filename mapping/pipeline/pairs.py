@@ -49,10 +49,6 @@ def write_pairs_of_dataset(
 
     Returns:
         The number of pairs, and notes on the photos that were left out.
-
-    Raises:
-        Conflict: ``pairs.exists``.
-        InvalidInput, DatasetError: with the option or the file that is wrong.
     """
     refuse_existing(job.output, "pairs.exists")
     check_names("--pairs", job.pairs, tuple(PAIRINGS))

@@ -40,11 +40,7 @@ class WrittenMap:
 
 
 def refuse_long_id(map_id: str) -> None:
-    """Refuse an id that leaves no room for the ids of pieces.
-
-    Raises:
-        InvalidInput: ``map.id``.
-    """
+    """Refuse an id that leaves no room for the ids of pieces."""
     if not ID_PATTERN.fullmatch(f"{map_id}{_LONGEST_SUFFIX}"):
         raise refuse(
             "map.id",
@@ -94,9 +90,6 @@ def use_version(store: MapStore, map_id: str, version: str) -> list[str]:
 
     Returns:
         ``id@version`` of all that are in use now, the given one first.
-
-    Raises:
-        NotFound: ``map.unknown`` or ``map.version``; and as ``MapStore.set_current``.
     """
     manifest = store.outline(f"{map_id}@{version}").manifest
     used: list[str] = []
@@ -126,17 +119,8 @@ def publish_pieces(store: MapStore, pieces: Sequence[WrittenMap], *, accept: boo
     earlier builds that none replaces are taken out of use. The largest is published last: once it
     is there, all are.
 
-    Args:
-        store: where they are published.
-        pieces: the largest first.
-        accept: put all into use whatever their tests say.
-
     Returns:
         The folder of the largest.
-
-    Raises:
-        Conflict: ``map.exists`` when somebody else published a map with the id of a piece since the
-            ids were chosen. Nothing is published; the same build chooses other ids.
     """
     largest, *others = pieces
     for each in others:

@@ -31,9 +31,6 @@ def landmark_colours(
 
     Args:
         photos: the n photos that observe the landmarks, with their files.
-
-    Raises:
-        VislocError: what ``MappingPhoto.read`` raises.
     """
     bounds = list(pairwise(landmarks.offsets.tolist()))
     items = [

@@ -36,10 +36,5 @@ class BuildContext:
     fixed: Mapping[str, CameraMask] = field(default_factory=dict)
 
     def run(self, stage: str, task: Callable[[T], object], items: Sequence[T]) -> None:
-        """Do a task for every item, as one stage.
-
-        Raises:
-            Unavailable: ``build.worker_died``.
-            Exception: what the task raised first.
-        """
+        """Do a task for every item, as one stage."""
         self.workers.run(task, items, partial(self.progress, stage))

@@ -68,9 +68,6 @@ class DepthMatcher:
 
     Args:
         depth_sensor: id of the only depth sensor to use; None to choose by rig, pose and size.
-
-    Raises:
-        DatasetError: ``depth.sensor`` if the sensor named is no depth sensor with intrinsics.
     """
 
     def __init__(self, dataset: Dataset, depth_sensor: str | None) -> None:
@@ -100,10 +97,6 @@ class DepthMatcher:
 
         Of several, the one registered to the photo wins (same pose, same aspect), then the only
         one of the photo's rig, then the only one with a pose of its own.
-
-        Raises:
-            DatasetError: ``depth.ambiguous`` if that leaves several, ``depth.pose`` if the pose of
-                the named sensor relative to the photo's camera is unknown.
         """
         of_rig: list[DepthMatch] = []
         of_world: list[DepthMatch] = []
@@ -158,9 +151,6 @@ def photo_depth(
 
     Returns:
         The depth map and the camera that sees it: the photo's, maybe of another size.
-
-    Raises:
-        DatasetError, InvalidInput: as ``read_depth``.
     """
     depth = read_depth(dataset.path_of(match.record), match.camera, depth_scale)
     if _is_identity(match.cam_from_depth) and _is_resized(match.camera, camera):
@@ -177,11 +167,6 @@ def read_depth(path: Path, camera: Camera, depth_scale: float) -> NDArray[np.flo
     Args:
         camera: the depth sensor's, for the size; a raw map has no header.
         depth_scale: metres per unit of a PNG.
-
-    Raises:
-        DatasetError: ``depth.missing``, ``depth.size``, ``depth.format`` or ``depth.damaged``.
-        InvalidInput: ``depth.scale``.
-        TooLarge: ``depth.too_many_pixels``.
     """
     if not (math.isfinite(depth_scale) and depth_scale > 0):
         raise refuse("depth.scale", field="--depth-scale", got=depth_scale)

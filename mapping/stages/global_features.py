@@ -54,11 +54,7 @@ _REVISION = {
 def describe_photos(
     context: BuildContext, photos: Sequence[MappingPhoto], name: str
 ) -> GlobalFeatures:
-    """Learn a global descriptor's model on the photos, and describe them with it.
-
-    Raises:
-        WeightsError, InvalidInput: what ``make_global_descriptor`` raises.
-    """
+    """Learn a global descriptor's model on the photos, and describe them with it."""
     work, descriptor = context.work, context.networks.descriptor(name)
     task = DescribeTask.of(context, name)
     vocabulary_key: str | None = None
@@ -105,11 +101,7 @@ def _learn_vocabulary(
 def describe_with_model(
     context: BuildContext, opened: Map, photos: Sequence[MappingPhoto], name: str
 ) -> NDArray[np.float32]:
-    """Describe photos (n, D) by a global descriptor of a map, with the model that it learned.
-
-    Raises:
-        WeightsError, InvalidInput: what ``make_global_descriptor`` raises.
-    """
+    """Describe photos (n, D) by a global descriptor of a map, with the model that it learned."""
     task = DescribeTask.of(context, name)
     stem = FingerprintRecord.of(context.networks.descriptor(name).fingerprint).file_stem
     file = opened.manifest.files[f"global/{stem}.model.npz"]
@@ -123,11 +115,7 @@ def describe_with_model(
 def read_global_features(
     dataset: Dataset, name: str, features_dir: Path | None, photos: Sequence[MappingPhoto]
 ) -> GlobalFeatures:
-    """Read the global descriptors ``kapture:TYPE`` that come with the dataset.
-
-    Raises:
-        DatasetError: with the file that is wrong or missing.
-    """
+    """Read the global descriptors ``kapture:TYPE`` that come with the dataset."""
     features = open_features(dataset.root, "global_features", ready_made_type(name), features_dir)
     rows = []
     for photo in photos:

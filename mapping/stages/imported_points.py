@@ -51,11 +51,7 @@ class ImportedPoints:
 
 
 def read_imported_points(opened: Map) -> ImportedPoints | None:
-    """Read and check the imported points of a map; None if it has none.
-
-    Raises:
-        MapCorrupt: ``map.imported_points``.
-    """
+    """Read and check the imported points of a map; None if it has none."""
     if FILE_NAME not in opened.manifest.files:
         return None
     path = opened.path / FILE_NAME

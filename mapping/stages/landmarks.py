@@ -62,12 +62,10 @@ class MadeLandmarks:
 
     Attributes:
         photos: (n,) int64 rows of the photos that have a pose in the map.
-        views: n, of these photos.
         landmarks: with observations by these photos, in their order.
         rows: for each of these photos, the rows of its features that observe the landmarks.
         settings: of the method, for the manifest.
         metric: whether a unit of the world is a metre.
-        anchor: how the world was fixed.
         rig_scale: units of the world per unit of the dataset's rigs; None when it is unknown.
         notes: what was left out, one sentence each.
         imported: the points of an imported reconstruction whose photos were matched again.

@@ -55,8 +55,6 @@ class ExtractedFeatures:
     load a network.
 
     Attributes:
-        name: of the extractor, in ``visloc.features.LOCAL_FEATURES``.
-        max_keypoints: strongest ones kept per photo.
         fixed: masks of what is fixed to the picture, by sensor; no keypoint is taken there.
     """
 
@@ -93,11 +91,7 @@ class ExtractedFeatures:
             self.read(photo)
 
     def read(self, photo: MappingPhoto) -> LocalFeatures:
-        """Return the features of a photo; extract them if necessary.
-
-        Raises:
-            VislocError: what ``MappingPhoto.read`` raises.
-        """
+        """Return the features of a photo; extract them if necessary."""
         item = self._get(photo)
         return LocalFeatures(**{name: item[name] for name in item if name != _TURN})
 
@@ -186,11 +180,7 @@ class ReadyMadeFeatures:
         self.read(photo)
 
     def read(self, photo: MappingPhoto) -> LocalFeatures:
-        """Return the features of a photo.
-
-        Raises:
-            DatasetError: with the file that is wrong.
-        """
+        """Return the features of a photo."""
         count = self.descriptors.count(photo.name)
         if count > MAX_READY_MADE_KEYPOINTS:
             raise refuse(
@@ -240,15 +230,11 @@ def local_features_source(
     """Return the source of local features that a name stands for.
 
     Args:
-        dataset: kapture folder.
         name: an extractor, or ``kapture:TYPE`` for features that come with the dataset.
         max_keypoints: strongest ones kept per photo; of ready-made features all are taken.
         features_dir: folder of ready-made features, if not the dataset.
         pixel_origin: of the coordinates of ready-made keypoints.
         workers: where the extractor is opened, to learn its properties.
-
-    Raises:
-        WeightsError, InvalidInput, DatasetError: what opening them raises.
     """
     if is_ready_made(name):
         keypoints, descriptors = open_local_features(dataset, ready_made_type(name), features_dir)
@@ -267,11 +253,7 @@ def local_features_source(
 
 @contextmanager
 def errors_in(features: FeatureSet, photo: MappingPhoto) -> Iterator[None]:
-    """Name the file in errors about its rows.
-
-    Raises:
-        DatasetError: for ``InvalidInput``, with its code.
-    """
+    """Name the file in errors about its rows."""
     try:
         yield
     except InvalidInput as error:

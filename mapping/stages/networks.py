@@ -34,11 +34,7 @@ class Networks:
     inference: Inference
 
     def extractor(self, name: str) -> LocalFeatureExtractor:
-        """Return this process's extractor.
-
-        Raises:
-            WeightsError, InvalidInput: what ``make_local_features`` raises.
-        """
+        """Return this process's extractor."""
         return open_extractor(name, self)
 
     def properties(self, name: str) -> ExtractorProperties:
@@ -64,11 +60,7 @@ def open_descriptor(name: str, networks: Networks) -> GlobalDescriptor:
 
 
 def refuse_other_computing(name: str, expected: str | None, here: str | None) -> None:
-    """Refuse a machine whose results would differ from those of the machine that builds.
-
-    Raises:
-        Unavailable: ``build.other_computing``.
-    """
+    """Refuse a machine whose results would differ from those of the machine that builds."""
     if here != expected:
         raise refuse(
             "build.other_computing", field="--inference", expected=expected, got=here, name=name

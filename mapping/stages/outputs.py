@@ -12,22 +12,14 @@ from visloc.errors import refuse
 
 
 def refuse_existing(output: Path, code: str) -> None:
-    """Refuse to overwrite a file or folder.
-
-    Raises:
-        Conflict: ``code``.
-    """
+    """Refuse to overwrite a file or folder."""
     if output.exists() or output.is_symlink():
         raise refuse(code, field=str(output))
 
 
 @contextmanager
 def complete_output(output: Path, code: str) -> Iterator[Path]:
-    """Give a path beside ``output``, which is renamed to ``output`` if the block succeeds.
-
-    Raises:
-        Conflict: ``code`` if ``output`` exists, before or after the work.
-    """
+    """Give a path beside ``output``, which is renamed to ``output`` if the block succeeds."""
     refuse_existing(output, code)
     output.parent.mkdir(parents=True, exist_ok=True)
     partial = output.with_name(f".{output.name}.{os.getpid()}.partial")

@@ -71,12 +71,6 @@ def read_in_frame(
 
     Args:
         size: width and height of the camera, pixels.
-        sensor_id: of the camera, for the error.
-        mask: file of its mask, if any.
-
-    Raises:
-        DatasetError: ``dataset.photo_size``.
-        VislocError: what ``read_photo_file`` raises.
     """
     photo = read_photo_file(path)
     if mask is not None:
@@ -121,15 +115,11 @@ def collect_photos(
             guessed intrinsics (SIMPLE_RADIAL) and no pose.
         with_files: take only photos whose file exists.
         has_features: tells whether a photo, by name, has ready-made features; others are left out.
-        with_depth: look for depth maps.
         depth_sensor: the depth sensor to use if a photo has several depth maps.
         progress: called with how many photos are done, and how many there are.
 
     Returns:
         The photos in the dataset's order, and notes on those left out.
-
-    Raises:
-        DatasetError: ``dataset.no_photos`` when none is left.
     """
     wanted = _Wanted(dataset, posed, with_files, has_features)
     photos: list[MappingPhoto] = []
@@ -196,9 +186,6 @@ def masked(
 
     Returns:
         The photos, and a note.
-
-    Raises:
-        DatasetError: ``masks.none``; ``dataset.unreadable``.
     """
     found = []
     for photo in photos:

@@ -23,9 +23,6 @@ def keep_photos(context: BuildContext, folder: Path, photos: Sequence[MappingPho
 
     They hold pixels in the frame of the photo's camera, and no metadata such as EXIF, place or
     time.
-
-    Raises:
-        VislocError: what ``MappingPhoto.read`` raises.
     """
     context.run("small photos", partial(_keep, context.work), photos)
     for row, photo in enumerate(photos):

@@ -38,22 +38,14 @@ def new_version() -> tuple[str, str]:
 
 @contextmanager
 def sole_publisher(maps_dir: Path, map_id: str) -> Iterator[None]:
-    """Hold a map's lock, so that one job at a time makes versions of it.
-
-    Raises:
-        Conflict: ``build.running``.
-    """
+    """Hold a map's lock, so that one job at a time makes versions of it."""
     with exclusive(maps_dir / ".work" / f"{map_id}.lock"):
         yield
 
 
 @contextmanager
 def successor_of(opened: Map, store: MapStore) -> Iterator[None]:
-    """Hold a map's lock while a version is made that replaces this one, its current one.
-
-    Raises:
-        Conflict: ``map.outdated`` when another version is current; ``build.running``.
-    """
+    """Hold a map's lock while a version is made that replaces this one, its current one."""
     map_id, version = opened.manifest.id, opened.manifest.version
     with sole_publisher(store.root, map_id):
         if (current := store.current_version(map_id)) != version:

@@ -69,11 +69,7 @@ class WorkFolder:
         return Path(tempfile.gettempdir()) if is_remote(self.root) else self.root
 
     def claim(self) -> None:
-        """Mark the folder as finished work, so that it may be removed.
-
-        Raises:
-            InvalidInput: ``build.work_dir`` for a folder with other files.
-        """
+        """Mark the folder as finished work, so that it may be removed."""
         marker = self.root / _MARKER
         if marker.is_file():
             return
@@ -98,11 +94,7 @@ class WorkFolder:
         return self._path(key).is_file()
 
     def read(self, key: str) -> Item:
-        """Read a finished item.
-
-        Raises:
-            Unavailable: ``build.damaged_item``, ``build.missing_item``.
-        """
+        """Read a finished item."""
         try:
             return self._load(key)
         except FileNotFoundError as error:
@@ -147,9 +139,6 @@ def exclusive(lock: Path) -> Iterator[None]:
     """Hold a lock file against a second build; it is released when the process ends.
 
     The file stays, since two builds could hold locks of the same name if it were removed.
-
-    Raises:
-        Conflict: ``build.running``.
     """
     lock.parent.mkdir(parents=True, exist_ok=True)
     with lock.open("a") as file:  # an existing file keeps its content

@@ -35,10 +35,6 @@ def time_limit_of(header: str | None, limit_s: float) -> TimeLimit:
 
     Args:
         header: what the caller asks for; None when it does not say.
-        limit_s: the most that the server allows.
-
-    Raises:
-        InvalidInput: ``request.timeout`` when it is not a positive number.
     """
     if header is None:
         return TimeLimit(limit_s)
@@ -53,11 +49,7 @@ def time_limit_of(header: str | None, limit_s: float) -> TimeLimit:
 
 @asynccontextmanager
 async def within(limit: TimeLimit) -> AsyncIterator[None]:
-    """Give up what the block waits for when the time is over.
-
-    Raises:
-        TimedOut: ``request.deadline`` when the caller chose the limit, else ``server.deadline``.
-    """
+    """Give up what the block waits for when the time is over."""
     try:
         async with asyncio.timeout(limit.seconds):
             yield
@@ -70,11 +62,7 @@ async def within(limit: TimeLimit) -> AsyncIterator[None]:
 
 
 async def each_within(limit: TimeLimit, items: AsyncIterator[T]) -> AsyncGenerator[T]:
-    """Give items as they come, each within a time after the one before was taken.
-
-    Raises:
-        TimedOut: as ``within`` raises.
-    """
+    """Give items as they come, each within a time after the one before was taken."""
     while True:
         async with within(limit):
             try:

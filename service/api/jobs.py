@@ -34,11 +34,7 @@ class Parts:
         self._left = dict(files)
 
     def take(self, name: str, field: str) -> bytes:
-        """Return the file that a field names.
-
-        Raises:
-            InvalidInput: ``request.part`` when it was not sent, or another field named it already.
-        """
+        """Return the file that a field names."""
         if name not in self._left:
             raise refuse(
                 "request.part",
@@ -52,11 +48,7 @@ class Parts:
         return self._left.pop(name)
 
     def check_all_taken(self) -> None:
-        """Refuse a file that no image names.
-
-        Raises:
-            InvalidInput: ``request.part``.
-        """
+        """Refuse a file that no image names."""
         if self._left:
             name = next(iter(self._left))
             raise refuse(
@@ -69,12 +61,7 @@ class Parts:
 
 
 def photo_job_of(request: LocalizeRequest) -> RigJob:
-    """Return the work of localizing one photo.
-
-    Raises:
-        InvalidInput: ``request.query``, ``request.map``, ``near...``, ``features...``,
-            ``camera...``, ``options...``, ``priors...``, ``pose...`` or ``debug.needs_photo``.
-    """
+    """Return the work of localizing one photo."""
     if request.debug and request.features is not None:
         raise refuse("debug.needs_photo", field="debug", got="true")
     return photo_job(
@@ -92,12 +79,7 @@ def rig_job_of(request: LocalizeRigRequest, files: Mapping[str, bytes] = NO_FILE
     """Return the work of localizing the images of a rig.
 
     Args:
-        request: in words.
         files: the files of a form by the names of their parts.
-
-    Raises:
-        InvalidInput: ``request...``, ``near...``, ``rig...``, ``features...``, ``camera...``,
-            ``options...``, ``priors...`` or ``pose...``.
     """
     where = _where(request)
     if request.rig is None:
@@ -117,12 +99,7 @@ def rig_job_of(request: LocalizeRigRequest, files: Mapping[str, bytes] = NO_FILE
 
 
 def sequence_job_of(start: SequenceStart) -> SequenceJob:
-    """Return what the instants of a sequence share.
-
-    Raises:
-        InvalidInput: ``request.map``, ``near...``, ``rig...``, ``camera...``, ``options...``,
-            ``priors...`` or ``pose...``.
-    """
+    """Return what the instants of a sequence share."""
     return SequenceJob(
         maps=_where(start),
         rig=None if start.rig is None else _rig(start.rig),
@@ -147,12 +124,7 @@ def _options_without_fallback(request: LocalizeRigRequest | SequenceStart) -> Lo
 
 
 def instant_job_of(instant: Instant, parts: Parts, *, has_rig: bool) -> InstantJob:
-    """Return the work of one instant, its images not decoded.
-
-    Raises:
-        InvalidInput: ``request...``, ``rig.timestamps``, ``features...``, ``camera...``,
-            ``priors...`` or ``pose...``.
-    """
+    """Return the work of one instant, its images not decoded."""
     images, _ = _images(instant.images, instant.timestamp, parts, has_rig=has_rig)
     return InstantJob(
         instant.timestamp,
@@ -168,11 +140,7 @@ def sequence_jobs_of(
     """Return the work of a whole sequence.
 
     Args:
-        request: in words.
         files: the files of a form by the names of their parts.
-
-    Raises:
-        InvalidInput: as ``sequence_job_of`` and ``instant_job_of``, and ``request.part``.
     """
     sequence, parts, jobs = sequence_job_of(request), Parts(files), []
     for number, instant in enumerate(request.instants):

@@ -56,9 +56,6 @@ class OneByOne:
         Args:
             parse: is not called when the caller is cancelled before its turn.
             size: of the message, bytes.
-
-        Raises:
-            Overloaded: ``server.busy`` when too much waits.
         """
         # Without a variable for what holds the error: they would hold each other, and the message.
         return await asyncio.wrap_future(self._enqueued(parse, size))

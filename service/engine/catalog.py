@@ -69,7 +69,6 @@ class _Version:
         folder: None until it is on this machine and read.
         outline: of a set; None for a map.
         users: number of requests that use it.
-        is_leaving: it is being deleted.
     """
 
     folder: MapFolder | None = None
@@ -143,12 +142,7 @@ class Catalog:
 
     @asynccontextmanager
     async def using(self, where: Where) -> AsyncIterator[tuple[MapFolder, ...]]:
-        """Yield the maps to search. They stay open until the block ends, even if replaced.
-
-        Raises:
-            NotFound: ``map.unknown``, ``map.version``, ``map.none_near``.
-            VislocError: errors of the store and of ``Vision.load``.
-        """
+        """Yield the maps to search. They stay open until the block ends, even if replaced."""
         if isinstance(where, Near):
             refs = await asyncio.to_thread(self.listing.searched_near, where)
         else:
@@ -172,22 +166,13 @@ class Catalog:
             self._release(ref)
 
     async def activate(self, map_id: str, version: str) -> None:
-        """Make a version current once a worker process has it open and warm.
-
-        Raises:
-            VislocError: as in ``using``; then nothing has changed.
-        """
+        """Make a version current once a worker process has it open and warm."""
         opened = await self._open(f"{map_id}@{version}")
         await asyncio.to_thread(self._store.set_current, map_id, version)
         self._serve(map_id, opened)
 
     async def delete(self, map_id: str, version: str, limit_s: float) -> None:
-        """Delete a version that is not current; wait at most ``limit_s`` for requests that use it.
-
-        Raises:
-            NotFound: ``map.unknown``, ``map.version``.
-            Conflict: ``map.version_in_use``, ``map.in_set``.
-        """
+        """Delete a version that is not current; wait ``limit_s`` for requests that use it."""
         ref = f"{map_id}@{version}"
         with suppress(VislocError):  # noted in not_loaded
             # A request that began before the last change may have brought the older version back.

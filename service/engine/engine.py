@@ -42,7 +42,6 @@ class Status:
     Attributes:
         ready: whether photos are accepted: the maps to open at start are open and warm, a worker
             process is alive, and the server is not being stopped.
-        maps: ``id@version`` of loaded maps.
         not_loaded: why the current version of a map cannot be served, by map id. An older
             version of it may be in ``maps``.
     """
@@ -58,12 +57,8 @@ class Engine:
     Used from one event loop.
 
     Args:
-        workers: number of processes.
         max_queue: photos that may wait; one more is refused with ``server.busy``.
-        max_batches: rigs and sequences that are served at once.
         max_upload_bytes: largest packed map.
-        limit_s: longest time of one task of a worker.
-        metrics: count events of maps and workers.
         on_overdue: called for every worker process that is ended (see ``Workers``).
     """
 
@@ -105,11 +100,7 @@ class Engine:
         self._withdrawn = self._draining = False
 
     async def start(self) -> None:
-        """Open and warm up all current maps; a broken one does not stop the others.
-
-        Raises:
-            Unavailable: the maps cannot be listed, or no process starts; it can be called again.
-        """
+        """Open and warm up all current maps; a broken one does not stop the others."""
         await asyncio.to_thread(self._store.sweep)
         if not self.workers.started:
             await self.workers.start()
@@ -163,13 +154,7 @@ class Engine:
         return self._batches
 
     async def localize(self, job: RigJob) -> Localization:
-        """Localize a single photo, or its features.
-
-        Raises:
-            Overloaded: ``server.busy`` when too many photos are waiting.
-            Unavailable: ``server.starting`` before ``start`` is done, ``server.worker_died``.
-            VislocError: errors of the store, of the photo, and of ``Localizer``.
-        """
+        """Localize a single photo, or its features."""
         self.check_room()
         self._photos += 1
         try:
@@ -178,24 +163,14 @@ class Engine:
             self._photos -= 1
 
     def check_room(self) -> None:
-        """Refuse a photo before it is read, when too many are waiting.
-
-        Raises:
-            Overloaded: ``server.busy``.
-            Unavailable: ``server.starting``, ``server.stopping``.
-        """
+        """Refuse a photo before it is read, when too many are waiting."""
         self._check_ready()
         if self._photos >= self._max_photos:
             raise refuse("server.busy", "too many photos are waiting; try again shortly")
 
     @contextmanager
     def admit_batch(self) -> Iterator[None]:
-        """Count a rig or a sequence among those that are served.
-
-        Raises:
-            Overloaded: ``server.busy`` when there are too many.
-            Unavailable: ``server.starting`` before ``start`` is done.
-        """
+        """Count a rig or a sequence among those that are served."""
         self._check_ready()
         if self._batches >= self._max_batches:
             raise refuse(
@@ -211,11 +186,6 @@ class Engine:
         """Localize the images of one instant together, within ``admit_batch``.
 
         An image that cannot be used fails alone.
-
-        Raises:
-            InvalidInput: ``rig.*``, ``options.*``, ``priors.*``.
-            Unavailable: ``server.worker_died``.
-            VislocError: errors of the store.
         """
         if not job.images:
             raise refuse("rig.empty", "there is no image", field="images")
@@ -251,12 +221,6 @@ class Engine:
         previous answers. A list of instants is checked before any work. In a set of maps, only
         their number and order and the names of tiles are checked. With several maps, answers wait
         until only one map explains an instant; that map localizes the rest of the sequence.
-
-        Raises:
-            InvalidInput: ``sequence.*``, ``rig.*``, ``options.*``, ``priors.*``.
-            TooLarge: ``sequence.too_many_instants``, ``rig.too_many_images``.
-            Unavailable: ``server.worker_died``.
-            VislocError: errors of the store.
         """
         async with self._catalog.using(start.maps) as maps:
             sets, alone = parted(maps, start.priors)
@@ -289,19 +253,11 @@ class Engine:
         return await asyncio.to_thread(self._catalog.listing.all, near)
 
     async def map(self, ref: str) -> ServedMap:
-        """Return one map: ``id``, or ``id@version``.
-
-        Raises:
-            VislocError: errors of the store.
-        """
+        """Return one map: ``id``, or ``id@version``."""
         return await asyncio.to_thread(self._catalog.listing.describe, ref)
 
     async def upload(self, map_id: str, version: str, chunks: AsyncIterator[bytes]) -> ServedMap:
-        """Publish a packed map after it was verified and tried, without making it current.
-
-        Raises:
-            VislocError: errors of ``Uploads.publish``.
-        """
+        """Publish a packed map after it was verified and tried, without making it current."""
         self._check_ready()
 
         async def counted() -> AsyncIterator[bytes]:
@@ -318,25 +274,14 @@ class Engine:
         await self.workers.run_again_if_killed(Vision.try_out, version)
 
     async def set_current(self, map_id: str, version: str) -> ServedMap:
-        """Make a version current once a worker process has it open and warm.
-
-        Raises:
-            NotFound: ``map.unknown``, ``map.version``.
-            Conflict: ``map.features`` when its features are not installed.
-            VislocError: errors of the store; then the previous version stays current.
-        """
+        """Make a version current once a worker process has it open and warm."""
         self._check_ready()
         with self._noted("activate"):
             await self._catalog.activate(map_id, version)
         return await self.map(f"{map_id}@{version}")
 
     async def delete(self, map_id: str, version: str) -> None:
-        """Delete a version that is not current.
-
-        Raises:
-            NotFound: ``map.unknown``, ``map.version``.
-            Conflict: ``map.version_in_use``.
-        """
+        """Delete a version that is not current."""
         with self._noted("delete"):
             await self._catalog.delete(map_id, version, self._limit_s)
 

@@ -25,11 +25,7 @@ class Fetcher:
         self._fetching: dict[str, asyncio.Future[Path]] = {}  # by id@version
 
     async def folder(self, ref: str) -> Path:
-        """Return the folder of ``id@version`` on this machine; fetch it if necessary.
-
-        Raises:
-            VislocError: errors of the store.
-        """
+        """Return the folder of ``id@version`` on this machine; fetch it if necessary."""
         here = await asyncio.to_thread(self._store.at_hand, ref)
         if here is not None:
             return here

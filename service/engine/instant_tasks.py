@@ -19,10 +19,6 @@ async def localize_in(workers: Workers, job: RigJob, maps: tuple[MapFolder, ...]
     """Localize a photo in one task; a rig with a task for each image, and one for all together.
 
     An image of a rig that cannot be used fails alone.
-
-    Raises:
-        InvalidInput: ``rig.*``, ``options.*``, ``priors.*``; errors of a single photo.
-        Unavailable: ``server.worker_died``.
     """
     if job.rig is None:
         return await workers.run(Vision.localize, job, maps, time())
@@ -64,11 +60,7 @@ T = TypeVar("T")
 
 
 async def together(work: Iterable[Coroutine[Any, Any, T]]) -> list[T]:
-    """Run coroutines concurrently, and return their results in order.
-
-    Raises:
-        Exception: the first error; the other coroutines have been cancelled and have ended.
-    """
+    """Run coroutines concurrently, and return their results in order."""
     tasks = [asyncio.ensure_future(each) for each in work]
     try:
         return await asyncio.gather(*tasks)

@@ -27,7 +27,6 @@ class Listing:
     """Describes the maps of a store. All methods block, and are safe in several threads.
 
     Args:
-        store: where the maps are.
         served_ref: returns ``id@version`` of the served version of a map; None if none is served.
     """
 
@@ -37,11 +36,7 @@ class Listing:
         self._set_ids = set[str]()  # of the maps that were described as sets
 
     def describe(self, ref: str) -> ServedMap:
-        """Describe ``id``, in the version that is served, or ``id@version``.
-
-        Raises:
-            VislocError: errors of the store.
-        """
+        """Describe ``id``, in the version that is served, or ``id@version``."""
         map_id, at, version = ref.partition("@")
         try:
             current = self._store.current_version(map_id)
@@ -84,12 +79,7 @@ class Listing:
         self._described.pop(ref, None)
 
     def searched_near(self, near: Near) -> tuple[str, ...]:
-        """Return the ids of the maps to search in a circle, with sets in place of their tiles.
-
-        Raises:
-            NotFound: ``map.none_near``.
-            InvalidInput: ``request.map`` when there are too many.
-        """
+        """Return the ids of the maps to search in a circle, with sets in place of their tiles."""
         sets, alone = self._sets_and_others()
         found = [one.manifest.id for one in sets if _reaches(one, near)]
         for map_id in alone:

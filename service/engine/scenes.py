@@ -53,9 +53,6 @@ class Scenes:
         """Return ``count`` landmarks of the level-of-detail order, from index ``first`` on.
 
         They are packed as in docs/api.md.
-
-        Raises:
-            VislocError: ``map.version``, ``map.array``, ``map.range``, errors of the store.
         """
         manifest = outline.manifest
         order = await self._orders.get(manifest.content_hash, lambda: self._order(outline))
@@ -65,12 +62,7 @@ class Scenes:
             return await _in(self._threads, work)
 
     async def photos(self, outline: MapOutline) -> MappingPhotos:
-        """Return the mapping photos of a version.
-
-        Raises:
-            VislocError: ``map.version``, ``map.json``, ``map.images``, ``map.array``, errors of the
-                store.
-        """
+        """Return the mapping photos of a version."""
 
         async def read() -> MappingPhotos:
             async with self._catalog.reading(outline.ref) as version:

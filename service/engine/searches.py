@@ -34,11 +34,7 @@ class SetSearches:
         self._search: Search | None = None
 
     def of(self, map_set: MapFolder) -> Search:
-        """Return what searches a set.
-
-        Raises:
-            Conflict: ``set.extension`` where no extension does.
-        """
+        """Return what searches a set."""
         if self._search is None:
             search: Search = kind_of_sets(map_set.ref).search(*self._parts)
             self._search = search
@@ -46,11 +42,7 @@ class SetSearches:
 
 
 async def answers_of(searches: Sequence[Coroutine[Any, Any, Localization]]) -> list[Localization]:
-    """Search maps and sets concurrently; ignore sets without a tile that the priors allow.
-
-    Raises:
-        NotFound: ``set.no_tile`` if nothing is left to search.
-    """
+    """Search maps and sets concurrently; ignore sets without a tile that the priors allow."""
 
     async def answer_of(search: Coroutine[Any, Any, Localization]) -> Localization | NotFound:
         try:

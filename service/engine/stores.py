@@ -8,11 +8,7 @@ from visloc.archive import MapStore, open_remote_store
 
 
 def open_store(maps_dir: str, cache_dir: Path, max_cache_bytes: int) -> MapStore:
-    """Return the store in a folder or at a URL; the cache is for a URL.
-
-    Raises:
-        ValueError: the URL cannot be used, or the path is not a folder.
-    """
+    """Return the store in a folder or at a URL; the cache is for a URL."""
     if "://" in maps_dir:
         try:
             return open_remote_store(maps_dir, cache_dir, max_cache_bytes)

@@ -34,7 +34,6 @@ class Uploads:
     """Publishes uploaded maps. Used from one event loop.
 
     Args:
-        store: the maps.
         max_bytes: limit of a packed map, and of its files together.
         try_out: opens a verified version as a query does; raises if it cannot be used.
     """
@@ -52,14 +51,6 @@ class Uploads:
 
         If the map cannot be published, its body is not read. Even if this is cancelled, temporary
         files are deleted, and the version is published whole or not at all.
-
-        Raises:
-            Conflict: ``map.version_exists``, ``map.upload_runs``.
-            TooLarge: ``request.too_large``, ``packed.too_large``.
-            InvalidInput: ``map.id``, ``packed.*``, and errors of ``verify_map``.
-            StorageFull: ``maps.storage_full``.
-            Forbidden: ``maps.read_only``.
-            Unavailable: ``server.worker_died`` when trying the map ended two processes.
         """
         ref = f"{checked_name(map_id, 'map')}@{checked_name(version, 'map version')}"
         if version in await asyncio.to_thread(self._store.versions, map_id):

@@ -32,8 +32,6 @@ class AccessInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
     """Admits or refuses a call before any of its messages is read.
 
     Args:
-        access: decides.
-        envelope: answers refused calls.
         max_keyless: calls open at once that need no key, so that callers with a key find a slot.
     """
 

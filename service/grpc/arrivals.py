@@ -24,7 +24,6 @@ class TimelyCalls(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
 
     Args:
         envelope: answers the calls that end before their method runs.
-        grace_s: the longest silence within a stream.
         max_message_bytes: of one message. gRPC does not tell how much of a message has arrived,
             so every large one gets the time of the largest: ``grace_s`` plus a second for every
             100 kB.

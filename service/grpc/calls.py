@@ -75,8 +75,6 @@ def handler_like(
     message has arrived, however long that takes.
 
     Args:
-        handler: gives the types.
-        behaviour: the code to run.
         parse: reads messages in place of the handler's own parser.
     """
     make: Any = (

@@ -52,7 +52,6 @@ class Envelope:
         elsewhere as long as nothing was answered.
 
         Args:
-            method: its name.
             streams: whether the block writes answers to the context.
         """
         caller = dict(context.invocation_metadata() or ()).get("traceparent")

@@ -34,11 +34,7 @@ _OPTIONAL_LISTS = {
 
 
 def near_of(request: pb2.ListMapsRequest) -> Near | None:
-    """Return the circle into which the maps must reach, if any.
-
-    Raises:
-        InvalidInput: ``near...`` or ``request.missing_field``.
-    """
+    """Return the circle into which the maps must reach, if any."""
     given = _plain(request).get("near")
     if given is None:
         return None
@@ -48,12 +44,7 @@ def near_of(request: pb2.ListMapsRequest) -> Near | None:
 
 
 def localize_job_of(request: pb2.LocalizeRequest, max_bytes: int) -> RigJob:
-    """Return the work of ``Localize``.
-
-    Raises:
-        TooLarge: ``request.too_large``; larger messages are for several photos.
-        InvalidInput: as ``LocalizeRequest`` raises.
-    """
+    """Return the work of ``Localize``."""
     size = request.ByteSize()
     if size > max_bytes:
         raise refuse(
@@ -63,11 +54,7 @@ def localize_job_of(request: pb2.LocalizeRequest, max_bytes: int) -> RigJob:
 
 
 def rig_job_of(request: pb2.LocalizeRigRequest, limits: BatchLimits) -> RigJob:
-    """Return the work of ``LocalizeRig``.
-
-    Raises:
-        InvalidInput: as ``LocalizeRigRequest`` raises.
-    """
+    """Return the work of ``LocalizeRig``."""
     return jobs.rig_job_of(LocalizeRigRequest.read(_plain(request), limits))
 
 
@@ -76,9 +63,6 @@ def sequence_start_of(message: pb2.LocalizeSequenceRequest | None) -> SequenceJo
 
     Args:
         message: the first of the stream; None when there was none.
-
-    Raises:
-        InvalidInput: ``sequence.message`` when it is no start, or as ``SequenceStart`` raises.
     """
     kind = None if message is None else message.WhichOneof("message")
     if message is None or kind != "start":
@@ -89,16 +73,7 @@ def sequence_start_of(message: pb2.LocalizeSequenceRequest | None) -> SequenceJo
 def instant_of(
     message: pb2.LocalizeSequenceRequest, limits: BatchLimits, number: int, *, has_rig: bool
 ) -> InstantJob:
-    """Return an instant of a sequence.
-
-    Args:
-        message: any but the first of the stream.
-        number: how many came before, for errors.
-        has_rig: whether the start named a rig.
-
-    Raises:
-        InvalidInput: ``sequence.message`` when it is no instant, or as ``Instant`` raises.
-    """
+    """Return an instant of a sequence."""
     kind = message.WhichOneof("message")
     if kind != "instant":
         raise _wrong_message(f"message {number + 2}", "instant", kind)
@@ -117,10 +92,6 @@ def _plain(message: Message) -> dict[str, Any]:
     """Return a message's fields as JSON would have them; fields that are not there are left out.
 
     Numbers, texts and lists without presence are there when they are zero or empty.
-
-    Raises:
-        InvalidInput: ``request.unknown_field``; protobuf passes over fields that it does not know,
-            or that come as another type.
     """
     unknown = UnknownFieldSet(message)
     if len(unknown) > 0:

@@ -39,8 +39,6 @@ class Unread:
     fails.
 
     Attributes:
-        message: as it came.
-        parse: reads it.
         kind: its type; None when values are not counted.
     """
 
@@ -49,12 +47,7 @@ class Unread:
     kind: Descriptor | None
 
     async def read(self) -> Any:
-        """Parse the message.
-
-        Raises:
-            TooLarge: ``request.too_large`` when it has too many values.
-            InvalidInput: ``request.malformed``.
-        """
+        """Parse the message."""
         if self.kind is None or num_values(self.message, self.kind, _FEW + 1) <= _FEW:
             _many.set(None)
             return self._parsed()
@@ -104,11 +97,6 @@ def num_values(data: bytes, kind: Descriptor, enough: int) -> int:
     Two bytes make an empty message within a message. It takes 50 bytes and 0.2 microseconds to
     parse, without a pause for other threads: 64 MB would take gigabytes and seconds. Neither gRPC
     nor a proxy bounds that. Counts up to the first malformed byte; the parser reports it.
-
-    Args:
-        data: an encoded message.
-        kind: its type.
-        enough: the count at which to stop.
     """
     count, waiting = 0, [(0, len(data), kind)]
     try:

@@ -27,11 +27,7 @@ _IDLE_MS = 60_000
 
 
 class GrpcServer:
-    """The server with health and reflection; health says NOT_SERVING at first.
-
-    Raises:
-        RuntimeError: when the address cannot be bound.
-    """
+    """The server with health and reflection; health says NOT_SERVING at first."""
 
     def __init__(
         self,

@@ -26,7 +26,6 @@ def add_access(app: Starlette, access: Access, observer: Observer, *, page: bool
     Call this before the envelope is added, which must be outermost: it gives requests their ids.
 
     Args:
-        access: the rules.
         observer: learns of refusals.
         page: whether the app serves the files of the page, which need no key.
     """

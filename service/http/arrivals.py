@@ -33,14 +33,7 @@ class Arrivals:
 
     @asynccontextmanager
     async def body(self, request: Request, limit: int) -> AsyncIterator[bytes]:
-        """Read a body. Its bytes count as held until the block ends.
-
-        Raises:
-            TooLarge: ``request.too_large``, before the rest of the body is read.
-            Overloaded: ``server.busy`` when too much is held.
-            TimedOut: ``request.too_slow``.
-            ClientDisconnect: when the client hung up.
-        """
+        """Read a body. Its bytes count as held until the block ends."""
         declared = request.headers.get("content-length", "")
         size = int(declared[:20]) if declared.isdecimal() else 0  # HTTP's parser allows 20 digits
         if size > limit:
@@ -62,12 +55,7 @@ class Arrivals:
             self._held -= len(body)
 
     async def chunks(self, request: Request) -> AsyncGenerator[bytes]:
-        """Yield the chunks of a body as they arrive. They do not count as held.
-
-        Raises:
-            TimedOut: ``request.too_slow``.
-            ClientDisconnect: when the client hung up.
-        """
+        """Yield the chunks of a body as they arrive. They do not count as held."""
         started = asyncio.get_running_loop().time()
         received = 0
         async with aclosing(request.stream()) as stream:

@@ -53,12 +53,7 @@ async def parsed(text: str | bytes, parse: Callable[[], JobT]) -> JobT:
 
 
 async def read_localize_job(request: Request) -> RigJob:
-    """Read the body of ``POST /localize``, a form or JSON.
-
-    Raises:
-        TooLarge: ``request.too_large``, before the rest of the body is read.
-        InvalidInput: ``request...``, or a code of the wrong field.
-    """
+    """Read the body of ``POST /localize``, a form or JSON."""
     backend = backend_of(request)
     content_type = request.headers.get("content-type", "")
 
@@ -86,12 +81,7 @@ async def read_localize_job(request: Request) -> RigJob:
 
 
 async def read_rig_job(request: Request) -> RigJob:
-    """Read the body of ``POST /localize/rig``, a form or JSON.
-
-    Raises:
-        TooLarge: ``request.too_large``, before the rest of the body is read; ``rig.too_many_...``.
-        InvalidInput: ``request...``, or a code of the wrong field.
-    """
+    """Read the body of ``POST /localize/rig``, a form or JSON."""
     settings = backend_of(request).settings
     limits = BatchLimits(settings.max_rig_images, settings.max_instants)
 
@@ -104,13 +94,7 @@ async def read_rig_job(request: Request) -> RigJob:
 
 
 async def read_sequence_jobs(request: Request) -> tuple[SequenceJob, list[InstantJob]]:
-    """Read the body of ``POST /localize/sequence``, a form or JSON.
-
-    Raises:
-        TooLarge: ``request.too_large``, before the rest of the body is read;
-            ``sequence.too_many_instants``, ``rig.too_many_...``.
-        InvalidInput: ``request...``, or a code of the wrong field.
-    """
+    """Read the body of ``POST /localize/sequence``, a form or JSON."""
     settings = backend_of(request).settings
     limits = BatchLimits(settings.max_rig_images, settings.max_instants)
     max_values = max_sequence_values(settings)
@@ -133,24 +117,14 @@ def max_sequence_values(settings: ServiceSettings) -> int:
 
 
 async def read_use_version(request: Request) -> UseVersionRequest:
-    """Read the body of ``POST /maps/{map_id}/current``.
-
-    Raises:
-        TooLarge: ``request.too_large``.
-        InvalidInput: ``request...``.
-    """
+    """Read the body of ``POST /maps/{map_id}/current``."""
     checked_media_type(request, (_JSON,))
     async with backend_of(request).arrivals.body(request, REQUEST_OVERHEAD_BYTES) as body:
         return UseVersionRequest.read_json(body)
 
 
 def checked_media_type(request: Request, kinds: Collection[str]) -> str:
-    """Return the media type of the body.
-
-    Raises:
-        InvalidInput: ``request.content_type`` when it is none of ``kinds``, or JSON in another
-            charset than UTF-8; ``request.content_encoding`` when the body is compressed.
-    """
+    """Return the media type of the body."""
     encodings = ",".join(request.headers.getlist("content-encoding")).lower()
     if not {each.strip() for each in encodings.split(",")} <= {"", "identity"}:
         raise refuse("request.content_encoding", field="Content-Encoding", got=encodings[:100])
@@ -199,13 +173,8 @@ def parse_form(
     """Parse a whole form. This blocks: 20 MB take 0.05 s.
 
     Args:
-        content_type: the header, with the boundary.
         max_text_bytes: of each part of ``text_names``.
         text_names: the parts that are texts unless they have a file name.
-        expected: which parts the form should have, for errors.
-
-    Raises:
-        InvalidInput: ``request.malformed`` or ``request.duplicate_field``.
     """
     _, options = parse_options_header(content_type)
     charset = options.get(b"charset", b"utf-8").decode("latin-1")
@@ -310,11 +279,7 @@ def _no_request_text(form: Form) -> VislocError:
 
 
 def _check_kinds(form: Form) -> None:
-    """Refuse texts that must be files, and files that must be texts.
-
-    Raises:
-        InvalidInput: ``request.invalid``.
-    """
+    """Refuse texts that must be files, and files that must be texts."""
     # Features are JSON, which is text.
     for name in form.texts.keys() & (_FILES.keys() - {"features"}):
         raise refuse(

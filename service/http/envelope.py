@@ -150,10 +150,6 @@ def backend_of(request: Request) -> Backend:
 
 
 def limit_of(request: Request) -> TimeLimit:
-    """Return the time that the request may take.
-
-    Raises:
-        InvalidInput: ``request.timeout``.
-    """
+    """Return the time that the request may take."""
     limit_s = backend_of(request).settings.request_timeout_s
     return time_limit_of(request.headers.get(TIMEOUT_HEADER), limit_s)

@@ -62,11 +62,7 @@ def problem_response(error: VislocError, id_: str, status: HTTPStatus | None = N
 
 
 async def while_connected(receive: Receive, work: Coroutine[Any, Any, T]) -> T:
-    """Do the work; cancel it if the client hangs up.
-
-    Raises:
-        ClientDisconnect: when the client hung up.
-    """
+    """Do the work; cancel it if the client hangs up."""
 
     async def hang_up() -> None:
         while (await receive())["type"] != "http.disconnect":

@@ -59,7 +59,6 @@ class _File:
 
     Attributes:
         compressed: ``plain`` as gzip; None for formats that are compressed already.
-        etag: without quotes.
     """
 
     plain: bytes

@@ -13,20 +13,12 @@ _BUILT = Path(__file__).parent / "built"
 
 
 def page_folder() -> Path:
-    """Return the folder of the pages: ``index.html`` and others, and all else in ``assets/``.
-
-    Raises:
-        Unavailable: ``page.not_built``.
-    """
+    """Return the folder of the pages: ``index.html`` and others, and all else in ``assets/``."""
     return _built("page", "redoc.html")
 
 
 def report_parts() -> tuple[str, str]:
-    """Return the script and the style sheet of the report.
-
-    Raises:
-        Unavailable: ``page.not_built``.
-    """
+    """Return the script and the style sheet of the report."""
     folder = _built("report", "report.js")
     return (folder / "report.js").read_text("utf-8"), (folder / "report.css").read_text("utf-8")
 

@@ -98,7 +98,6 @@ def tokens_of(authorizations: Iterable[str], api_keys: Iterable[str]) -> set[str
 
     Args:
         authorizations: ``Authorization`` headers; kinds other than Bearer are for a proxy.
-        api_keys: ``X-API-Key`` headers.
     """
     tokens = set(api_keys)
     for authorization in authorizations:
@@ -113,7 +112,6 @@ class _Use:
     """The current use of a key: a token bucket.
 
     Attributes:
-        running: requests being served.
         left: requests that may come at once; grows with time.
         at: the time of ``left``, seconds.
     """
@@ -130,7 +128,6 @@ class Access:
         ring: the keys; without keys, everyone on this machine may do everything.
         origins: of the web pages that may call, as browsers send them; ``*`` for all. ``*`` and
             ``null`` only with keys.
-        proxies: tell in ``X-Forwarded-For`` whom they forward.
         now: a clock, seconds.
     """
 
@@ -160,12 +157,7 @@ class Access:
         to it (DNS rebinding).
 
         Args:
-            scheme: ``http`` or ``https``.
-            host: the ``Host`` header, with the port.
             origins: the ``Origin`` headers.
-
-        Raises:
-            Forbidden: ``access.host``, ``access.origin``.
         """
         if self._ring is not None:
             return
@@ -180,10 +172,6 @@ class Access:
 
         Args:
             tokens: the keys that were sent.
-
-        Raises:
-            Unauthenticated: ``access.key_missing``, ``access.key_unknown``.
-            Forbidden: ``access.scope``.
         """
         if self._ring is None or needed is None:
             return None
@@ -212,11 +200,7 @@ class Access:
 
     @contextmanager
     def place(self, key: Key | None) -> Iterator[None]:
-        """Count a request of a key while it is served.
-
-        Raises:
-            Overloaded: ``access.rate``, ``access.concurrency``.
-        """
+        """Count a request of a key while it is served."""
         if key is None:
             yield
             return
@@ -254,11 +238,7 @@ class Access:
 
 
 def open_access(settings: ServiceSettings) -> Access:
-    """Make the rules of a service; refuse settings that would leave it open.
-
-    Raises:
-        SettingsError: naming the setting.
-    """
+    """Make the rules of a service; refuse settings that would leave it open."""
     for origin in settings.cors_origins:
         _check_origin(origin, has_keys=settings.keys_file is not None)
     proxies = networks_of(settings.trusted_proxies)
@@ -326,9 +306,6 @@ def networks_of(names: Iterable[str]) -> Networks:
 
     Args:
         names: addresses, or networks such as ``10.1.0.0/16``.
-
-    Raises:
-        SettingsError: for one that is neither.
     """
     networks = []
     for name in names:

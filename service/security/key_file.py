@@ -64,7 +64,6 @@ class Key:
         id: names the key within its token.
         name: the owner, for people and logs.
         created: ISO 8601.
-        salt: hashed before the secret.
         sha256: of salt and secret.
         rate: requests per second in the long run; None: any number.
         burst: requests at once after a pause; only with a rate.
@@ -106,11 +105,7 @@ def new_key(
     burst: int | None = None,
     concurrency: int | None = None,
 ) -> tuple[Key, str]:
-    """Make a key; return it with its token, which only its owner may know.
-
-    Raises:
-        InvalidInput: ``keys.name``, ``keys.scopes``, ``keys.limit``.
-    """
+    """Make a key; return it with its token, which only its owner may know."""
     id_, secret = secrets.token_hex(6), secrets.token_urlsafe(_SECRET_BYTES)
     salt = secrets.token_bytes(_SALT_BYTES)
     burst = usual_burst(rate) if burst is None else burst
@@ -133,12 +128,7 @@ def split_token(token: str) -> tuple[str, str] | None:
 
 
 def read_keys(path: Path) -> tuple[Key, ...]:
-    """Read the keys of a file.
-
-    Raises:
-        InvalidInput: ``keys.file``, ``keys.permissions``, ``keys.name``, ``keys.scopes``,
-            ``keys.limit``; the field is the file and the entry in it.
-    """
+    """Read the keys of a file."""
     content = _content_of(path)
     try:
         keys = _KEY_FILE.validate_json(content.removeprefix(codecs.BOM_UTF8)).keys
@@ -172,11 +162,7 @@ def _content_of(path: Path) -> bytes:
 
 
 def check_key(key: Key, field: str) -> None:
-    """Refuse a key with a wrong name, wrong scopes or wrong limits.
-
-    Raises:
-        InvalidInput: ``keys.name``, ``keys.scopes``, ``keys.limit``.
-    """
+    """Refuse a key with a wrong name, wrong scopes or wrong limits."""
     try:
         _KEY.validate_python(key)
     except ValidationError as refused:
@@ -222,10 +208,6 @@ def edited_keys(path: Path) -> Iterator[list[Key]]:
     """Give the keys of a file, none if it does not exist, and write the list back if it changed.
 
     A lock keeps other editors out. Readers see either the old file or the new one.
-
-    Raises:
-        InvalidInput: as ``read_keys``.
-        OSError: when the folder cannot be written.
     """
     folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
     try:

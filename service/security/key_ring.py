@@ -18,9 +18,6 @@ class KeyRing:
     """Finds keys; reads the file again when it has changed.
 
     If the changed file cannot be used, that is logged and the old keys stay valid.
-
-    Raises:
-        InvalidInput: ``keys.*`` when the file cannot be used at the start.
     """
 
     def __init__(self, path: Path) -> None:

@@ -27,8 +27,6 @@ class _Pair:
 
     Attributes:
         ends: when the first certificate of the chain expires, seconds since 1970.
-        chain: PEM.
-        key: PEM.
     """
 
     ends: float
@@ -42,9 +40,6 @@ class Certificate:
 
     If changed files cannot be used, such as while only one of both is new, that is logged and the
     old certificate stays in use.
-
-    Raises:
-        SettingsError: naming the setting, when the files cannot be used at the start.
     """
 
     def __init__(self, chain: Path, key: Path) -> None:
@@ -109,11 +104,7 @@ class Certificate:
 
 
 def open_certificate(settings: ServiceSettings) -> Certificate | None:
-    """Read the certificate before any port is open; None without TLS.
-
-    Raises:
-        SettingsError: naming the setting.
-    """
+    """Read the certificate before any port is open; None without TLS."""
     chain, key = settings.tls_cert, settings.tls_key
     if chain is not None and key is not None:
         return Certificate(chain, key)
@@ -165,9 +156,6 @@ def _end_of(certificate: bytes) -> float:
     """Return when a certificate expires, seconds since 1970.
 
     Python's own ``ssl`` tells this only of certificates that it trusts (RFC 5280, section 4.1).
-
-    Args:
-        certificate: DER.
     """
     _, body, _ = _element(certificate)
     _, fields, _ = _element(body)

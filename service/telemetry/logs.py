@@ -30,7 +30,6 @@ class RequestRecord:
     """The facts about a request, gathered as it proceeds and logged when it ends.
 
     Attributes:
-        door: ``http`` or ``grpc``.
         request_id: the caller's if it was acceptable, else ours.
         trace: its span in the caller's trace, if there is one.
         key: the name of the API key.
@@ -39,7 +38,6 @@ class RequestRecord:
         status: of the answer, such as ``200`` or ``OK``; empty until there is one.
         map: the id of the map that answered.
         outcome: ``localized``, or the reason why not; of several instants, that of the last.
-        instants: the number answered.
         localized: how many of these were localized.
         code: of the error that was answered.
         failed: whether that error was the server's fault.

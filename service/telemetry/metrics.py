@@ -48,7 +48,6 @@ class ServiceState:
     """The service at one moment.
 
     Attributes:
-        worker_pids: of the worker processes alive.
         loaded_maps: bytes of each map that is open in a worker, by (id, version).
         unusable_maps: the error code of each map that exists and cannot be served, by id.
         certificate_ends: when the TLS certificate expires, seconds since 1970; None without TLS.
@@ -162,7 +161,6 @@ class Metrics:
         """Count a request that ended.
 
         Args:
-            door: ``http`` or ``grpc``.
             route: the template of its path or the name of its method, never the path itself.
             status: the HTTP status, the name of the gRPC status, or ``CANCELLED``.
             seconds: its duration.
@@ -180,7 +178,6 @@ class Metrics:
         """Count the answer to a photo or an instant.
 
         Args:
-            map_id: the map that gave it; it exists.
             reason: why there is no pose, a ``visloc.types.Reason``; None when there is one.
             inliers: of the best pose, accepted or not.
         """

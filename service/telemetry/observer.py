@@ -41,7 +41,6 @@ class Observer:
     """Watches the requests of both transports.
 
     Args:
-        metrics: counts them.
         spans: sends the spans of traced requests; None if tracing is off.
     """
 
@@ -59,8 +58,6 @@ class Observer:
         The block sets the record's ``status`` when it answers, and ``route`` once it is known.
 
         Args:
-            door: ``http`` or ``grpc``.
-            request_id: as ``service.api.deadlines`` returned it.
             route: the method and the template of the path, or the name of the gRPC method.
             traceparent: the caller's header, unchecked.
         """

@@ -120,9 +120,6 @@ class Spans:
 
     Args:
         endpoint: URL of the collector; ``/v1/traces`` is added to one without a path.
-
-    Raises:
-        SettingsError: for a URL that cannot be used, or when packages are not installed.
     """
 
     def __init__(self, endpoint: str) -> None:
@@ -196,9 +193,5 @@ class Spans:
 
 
 def open_spans(settings: ServiceSettings) -> Spans | None:
-    """Connect to the collector that the settings name, if any.
-
-    Raises:
-        SettingsError: see ``Spans``.
-    """
+    """Connect to the collector that the settings name, if any."""
     return None if settings.otlp_endpoint is None else Spans(settings.otlp_endpoint)

@@ -246,12 +246,7 @@ class Tools:
 
 
 def decode(query: Query, limits: ImageLimits, extractor_of: ExtractorOf) -> DecodedQuery:
-    """Decode an encoded photo, or unpack what ``pack`` returned in this service.
-
-    Raises:
-        InvalidInput: ``image.*`` or ``mask.size``.
-        TooLarge: ``image.too_large``.
-    """
+    """Decode an encoded photo, or unpack what ``pack`` returned in this service."""
     if isinstance(query, PackedQuery):
         found, seconds = pickle.loads(query.found)
         found = {(extractor_of(name), *how): features for (name, *how), features in found.items()}

@@ -65,14 +65,7 @@ class OpenMaps:
         return found
 
     def open(self, version: MapFolder) -> Localizer | OpenSet:
-        """Open a map or a set, unless it is open, and warm it up.
-
-        Raises:
-            Conflict: the map's features are not installed.
-            MapCorrupt: the map cannot be used.
-            NotFound: ``map.version``: it was removed.
-            Abandoned: nobody waits any more; the map stays open.
-        """
+        """Open a map or a set, unless it is open, and warm it up."""
         found = self._opened.get(version.ref)
         if found is None:
             self._signals.opening = True

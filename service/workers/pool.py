@@ -128,11 +128,9 @@ class Workers:
     """A fixed number of worker processes behind one queue. Used from one event loop.
 
     Args:
-        count: processes.
         limit_s: longest time that one task may take; a process that exceeds it is replaced.
         warm: the maps that may be open; a new process opens those that its predecessor had open,
             while no task waits.
-        on_death: called for every process that died by itself.
         on_overdue: called for every process that was ended because it went on with a request after
             its deadline, or after its caller had left; in the context of that request.
     """
@@ -191,11 +189,7 @@ class Workers:
         return {ref: size for one in self._workers for ref, size in one.open_maps}
 
     async def start(self) -> None:
-        """Start all processes.
-
-        Raises:
-            Unavailable: ``server.worker_died`` when a process cannot be started.
-        """
+        """Start all processes."""
         await asyncio.gather(*(one.start() for one in self._workers))
         self._serving = [asyncio.create_task(self._serve(one)) for one in self._workers]
 
@@ -206,10 +200,6 @@ class Workers:
 
         A task that has not begun is then dropped; a running one ends at its next step. If that
         takes too long, its process is ended.
-
-        Raises:
-            Unavailable: ``server.worker_died``; ``server.stopping`` after ``close``.
-            TimedOut: ``server.deadline`` when it exceeded the limit.
         """
         if self._closed:  # nobody would ever take it: uploads are verified until then
             raise stopping_error()
@@ -237,9 +227,6 @@ class Workers:
 
         Photos are not tried again: one that ended a process would end the next. Opening a map is,
         because most processes die of something else, and operators rarely repeat a swap.
-
-        Raises:
-            VislocError: as ``run``; ``server.worker_died`` when both processes died.
         """
         try:
             return await self.run(method, *args, **kwargs)
@@ -396,11 +383,7 @@ class _Worker:
         return started is not None and started.is_alive()
 
     async def start(self) -> None:
-        """Start a process.
-
-        Raises:
-            Unavailable: ``server.worker_died``.
-        """
+        """Start a process."""
         loop = asyncio.get_running_loop()
         self._kill()
         self.pid, self.alive, self.overdue = 0, True, False
@@ -414,12 +397,7 @@ class _Worker:
         await self._call(_START_LIMIT_S, _PING, self._settings.threads)
 
     async def run(self, limit_s: float, task: Task[T], threads: int) -> T:
-        """Run a task with so many threads.
-
-        Raises:
-            Unavailable: ``server.worker_died``.
-            TimedOut: ``server.deadline``; the process is killed.
-        """
+        """Run a task with so many threads."""
         self.busy = True
         try:
             return await self._call(limit_s, task, threads)

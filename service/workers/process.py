@@ -24,9 +24,7 @@ class Reply:
     """What became of a task.
 
     Attributes:
-        result: of the task.
         open_maps: the maps that are open after it.
-        error: what it raised.
         traceback: of the error, as text; frames cannot be sent.
     """
 

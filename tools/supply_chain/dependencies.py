@@ -28,11 +28,7 @@ def canonical(name: str) -> str:
 
 
 def needed_by(name: str, extras: Sequence[str] = ()) -> Iterator[Requirement]:
-    """Give what a distribution needs on this platform, with some of its extras.
-
-    Raises:
-        PackageNotFoundError: when it is not installed.
-    """
+    """Give what a distribution needs on this platform, with some of its extras."""
     for text in _own_needs(extras) if name == PROJECT else requires(name) or ():
         requirement = Requirement(text)
         marker = requirement.marker

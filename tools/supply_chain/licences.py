@@ -43,7 +43,6 @@ class Licensed:
     Attributes:
         version: of constraints.txt; empty for what it does not pin, such as pip itself.
         licence: an SPDX expression, or what the package says where the policy does not know it.
-        images: that hold it.
         bundled: libraries within its wheel that have another licence, as files or linked.
     """
 

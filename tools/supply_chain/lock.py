@@ -34,11 +34,7 @@ _HEADER = "# Made by `python -m tools.supply_chain.lock` from constraints.txt.\n
 
 
 def locked() -> dict[str, dict[str, str]]:
-    """Return what each lock holds: versions by canonical name, of constraints.txt.
-
-    Raises:
-        SystemExit: when something is needed that constraints.txt does not pin.
-    """
+    """Return what each lock holds: versions by canonical name, of constraints.txt."""
     needed = {name: of_extras(extras) for name, extras in IMAGES.items()}
     needed["build"] = closure([Requirement(name) for name in BUILD_TOOLS])
     pins = pinned()
@@ -53,11 +49,7 @@ def locked() -> dict[str, dict[str, str]]:
 
 
 def hashes_of(versions: Mapping[str, str]) -> dict[str, str]:
-    """Ask the package index, through pip, for the SHA-256 of each wheel for this platform.
-
-    Raises:
-        SystemExit: when pip finds one of them in no wheel.
-    """
+    """Ask the package index, through pip, for the SHA-256 of each wheel for this platform."""
     wanted = [f"{name}=={version}" for name, version in versions.items()]
     done = subprocess.run(
         [

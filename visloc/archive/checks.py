@@ -63,13 +63,7 @@ def _hash_without(manifest: Mapping[str, Any], *left_out: str) -> str:
 
 
 def read_manifest(folder: Path) -> Manifest:
-    """Read ``manifest.json`` of a map folder.
-
-    Raises:
-        MapCorrupt: ``map.manifest`` when it is missing or not a manifest; ``map.format_version``
-            for a newer major format.
-        InvalidInput: ``map.is_set`` for the manifest of a set.
-    """
+    """Read ``manifest.json`` of a map folder."""
     manifest = read_any_manifest(folder)
     if isinstance(manifest, SetManifest):
         raise is_set(f"{manifest.id}@{manifest.version}", manifest)
@@ -77,25 +71,13 @@ def read_manifest(folder: Path) -> Manifest:
 
 
 def read_any_manifest(folder: Path) -> Manifest | SetManifest:
-    """Read ``manifest.json`` of the folder of a map or a set.
-
-    Raises:
-        MapCorrupt: as ``read_manifest``.
-    """
+    """Read ``manifest.json`` of the folder of a map or a set."""
     path = folder / "manifest.json"
     return parse_any_manifest(_read_bytes(path, MAX_MANIFEST_BYTES, "map.manifest"), str(path))
 
 
 def parse_any_manifest(content: bytes, address: str) -> Manifest | SetManifest:
-    """Parse ``manifest.json`` of a map or a set.
-
-    Args:
-        content: the file.
-        address: where it was found, for error messages.
-
-    Raises:
-        MapCorrupt: as ``read_manifest``.
-    """
+    """Parse ``manifest.json`` of a map or a set."""
     if len(content) > MAX_MANIFEST_BYTES:
         raise _too_large(address, MAX_MANIFEST_BYTES, "map.manifest")
     text = _decoded(content, address, "map.manifest")
@@ -125,11 +107,7 @@ def is_set(ref: str, manifest: SetManifest) -> VislocError:
 
 
 def check_files(folder: Path, manifest: Manifest | SetManifest) -> None:
-    """Check that every file of the manifest exists and has its size.
-
-    Raises:
-        MapCorrupt: ``map.file_missing``, ``map.file_size`` or ``map.file_name``.
-    """
+    """Check that every file of the manifest exists and has its size."""
     for name, entry in manifest.files.items():
         parts = PurePosixPath(name).parts
         if not parts or ".." in parts or name.startswith("/") or "\\" in name or "\0" in name:
@@ -152,11 +130,7 @@ def check_files(folder: Path, manifest: Manifest | SetManifest) -> None:
 
 
 def check_checksums(folder: Path, manifest: Manifest | SetManifest) -> None:
-    """Read every byte of a map and compare it with the manifest.
-
-    Raises:
-        MapCorrupt: ``map.checksum`` or ``map.manifest_hash``.
-    """
+    """Read every byte of a map and compare it with the manifest."""
     for name, entry in manifest.files.items():
         digest = sha256_of(folder / name)
         if digest != entry.sha256:
@@ -196,15 +170,9 @@ def map_array(
     """Open one ``.npy`` of a map, memory-mapped and read-only unless ``load``.
 
     Args:
-        folder: the map.
-        name: the file.
         dtype: the type that it must have.
         shape: the shape that it must have.
         before: the type that older formats had, if another.
-        load: whether to read it into memory now.
-
-    Raises:
-        MapCorrupt: ``map.array`` when it is not exactly such an array.
     """
     path = folder / name
     found, offset, order = _array_header(path, dtype, shape, before)
@@ -228,14 +196,9 @@ def array_rows(
     truncated raises an error. Only blocks of the file that hold wanted rows are read.
 
     Args:
-        folder: the map.
-        name: the file.
         dtype: the type that it must have.
         shape: the shape that it must have.
         rows: (k,) in any order.
-
-    Raises:
-        MapCorrupt: ``map.array`` when it is not exactly such an array, or ends early.
     """
     path = folder / name
     found, offset, order = _array_header(path, dtype, shape, None)
@@ -264,11 +227,7 @@ def array_rows(
 
 
 def read_model(folder: Path, name: str) -> dict[str, NDArray[np.float32]]:
-    """Read the arrays of a global descriptor's model (``.npz`` without compression).
-
-    Raises:
-        MapCorrupt: ``map.array``.
-    """
+    """Read the arrays of a global descriptor's model (``.npz`` without compression)."""
     path = folder / name
     try:
         model = read_npz(path)

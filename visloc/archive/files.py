@@ -83,10 +83,6 @@ class Files:
     def finish(self, manifest: dict[str, Any], version: str) -> str:
         """Add version and hashes to a manifest, write it, and sync all files to disk.
 
-        Args:
-            manifest: everything else; its ``files`` are ``entries()``.
-            version: as for ``write_map``.
-
         Returns:
             The version.
         """

@@ -24,7 +24,6 @@ class GnssFix:
 
     Attributes:
         timestamp: in the unit of the photos' timestamps.
-        receiver: its name in ``Fixes.receivers``.
         x: longitude in degrees for EPSG:4326, otherwise easting.
         y: latitude in degrees for EPSG:4326, otherwise northing.
         z: altitude in metres.
@@ -98,8 +97,5 @@ def read_fixes(folder: Path, files: Mapping[str, Any]) -> Fixes | None:
     Args:
         folder: the map's folder.
         files: the files that the map's manifest lists, by name.
-
-    Raises:
-        MapCorrupt: ``map.json`` when the file is damaged.
     """
     return read_record(folder, GNSS_FILE, Fixes) if GNSS_FILE in files else None

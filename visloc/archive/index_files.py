@@ -38,11 +38,7 @@ def index_files(stem: str) -> IndexFiles:
 def open_index(
     folder: Path, files: IndexFiles, *, dim: int, num_lists: int, num_rows: int
 ) -> InvertedFile:
-    """Open an inverted file after checks of everything but the content of its lists.
-
-    Raises:
-        MapCorrupt: ``map.array``, ``map.range``.
-    """
+    """Open an inverted file after checks of everything but the content of its lists."""
     width = width_of(dim)
     centers = map_array(folder, files.centers, "<f4", (num_lists, width))
     sizes = map_array(folder, files.sizes, "<i8", (num_lists,), load=True)
@@ -77,11 +73,7 @@ def sizes_fit(sizes: NDArray[np.int64], num_rows: int) -> bool:
 
 
 def check_lists(opened: InvertedFile) -> None:
-    """Check that the lists number every row once and have finite codes.
-
-    Raises:
-        MapCorrupt: ``map.range``.
-    """
+    """Check that the lists number every row once and have finite codes."""
     content, start = np.memmap(opened.path, np.uint8, "r"), 0
     bytes_of_row = row_bytes(opened.centers.shape[1])
     seen = np.zeros(opened.num_rows, np.bool_)

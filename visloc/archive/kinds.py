@@ -17,14 +17,7 @@ from visloc.extensions import MAP_KINDS, extensions, load
 
 
 def kind_of_sets(ref: str) -> Any:
-    """Return what the extension registers for sets of maps (``visloc.extensions``).
-
-    Args:
-        ref: the set that it is needed for.
-
-    Raises:
-        Conflict: ``set.extension`` when no extension does.
-    """
+    """Return what the extension registers for sets of maps (``visloc.extensions``)."""
     entry = extensions(MAP_KINDS).get(SET_FORMAT)
     if entry is None:
         raise refuse("set.extension", field="map", got=ref)

@@ -21,7 +21,6 @@ def fits(model: Mapping[str, NDArray[np.float32]], dim: int) -> bool:
     Args:
         model: ``mean`` (R,) and ``axes`` (R, ``dim``) whiten a raw vector. With a ``vocabulary``
             (K, d), R is K * d.
-        dim: numbers of a row.
     """
     if any(np.abs(model[name]).max(initial=0) > _MAX_NUMBER for name in _OURS if name in model):
         return False

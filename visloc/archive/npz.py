@@ -27,12 +27,7 @@ def read_npz(archive: Path | bytes, kinds: str = "biuf") -> dict[str, NDArray[An
     are read. So memory never exceeds the size of the file, whatever its headers claim.
 
     Args:
-        archive: the file, or its content.
         kinds: NumPy's letters of the allowed types; by default numbers and booleans.
-
-    Raises:
-        ValueError: it is no such archive; the message says why.
-        OSError: the file cannot be read.
     """
     source = io.BytesIO(archive) if isinstance(archive, bytes) else archive
     size = len(archive) if isinstance(archive, bytes) else archive.stat().st_size
@@ -84,9 +79,6 @@ def read_npy_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[An
 
     Returns:
         Shape, whether the order is Fortran's, and type. They are not checked.
-
-    Raises:
-        ValueError: it is no such file.
     """
     try:
         version = np.lib.format.read_magic(file)

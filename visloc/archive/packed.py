@@ -51,9 +51,6 @@ def pack_map(folder: Path, output: Path) -> AnyManifest:
     Args:
         folder: the map, of which only presence and size of the files are checked.
         output: the file, which must not exist.
-
-    Raises:
-        MapCorrupt: when it is not a map.
     """
     manifest = read_any_manifest(folder)
     check_files(folder, manifest)
@@ -75,17 +72,8 @@ def unpack_map(file: Path, target: Path, max_bytes: int) -> AnyManifest:
     the bytes are those of the manifest is for ``verify_any``, before the map is used.
 
     Args:
-        file: the packed map.
         target: the folder, which must not exist. On an error some files may lie there.
         max_bytes: largest map.
-
-    Raises:
-        InvalidInput: ``packed.format``: not such an archive, or not a whole one; ``packed.entry``:
-            an entry that a packed map cannot have; ``packed.files``: other entries than the
-            manifest lists.
-        TooLarge: ``packed.too_large``.
-        MapCorrupt: when the manifest is damaged or too new.
-        StorageFull: ``maps.storage_full``.
     """
     with file.open("rb") as source, storage_errors(target), _format_errors():
         count = _check_end(source)

@@ -28,11 +28,7 @@ class MappingPhotos:
 
 
 def read_photos(folder: Path, outline: MapOutline) -> MappingPhotos:
-    """Read the mapping photos of a map whose outline was read.
-
-    Raises:
-        MapCorrupt: ``map.json``, ``map.images``, ``map.array``.
-    """
+    """Read the mapping photos of a map whose outline was read."""
     images = read_images(folder, outline)
     poses = map_array(folder, "image_poses.npy", "<f8", (len(images), 7), load=True)
     conjugate = np.where(poses[:, :1] < 0, -1.0, 1.0) * poses[:, :4] * (1.0, -1.0, -1.0, -1.0)

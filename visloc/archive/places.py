@@ -69,9 +69,6 @@ def located(priors: Priors, world: World | SetWorld) -> Priors:
     """Tell the GNSS prior where the world lies on Earth, unless somebody did.
 
     How well the map knows that (``Anchor.rms``) adds to the accuracy of the fix.
-
-    Raises:
-        InvalidInput: ``priors.gnss`` when the world's place on Earth is unknown.
     """
     fix = priors.gnss
     if fix is None or fix.fix_from_world is not None:
@@ -116,7 +113,6 @@ def circles_of(boxes: NDArray[np.float64], geodetic: Geodetic) -> NDArray[np.flo
 
     Args:
         boxes: (n, 2, 3) smallest and largest coordinates.
-        geodetic: where the world lies on Earth.
 
     Returns:
         (n, 3) latitude, longitude (deg) and radius (m).

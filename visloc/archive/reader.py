@@ -247,11 +247,7 @@ def open_map(folder: Path) -> Map:
 
 
 def read_images(folder: Path, outline: MapOutline) -> tuple[ImageRecord, ...]:
-    """Read names and cameras of the mapping photos of a map.
-
-    Raises:
-        MapCorrupt: ``map.json``, ``map.images``.
-    """
+    """Read names and cameras of the mapping photos of a map."""
     images = read_record(folder, "images.json", ImagesFile).images
     num = outline.manifest.counts.images
     if len(images) != num or any(image.camera not in outline.cameras for image in images):

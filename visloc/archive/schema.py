@@ -289,7 +289,6 @@ class Doubt(Record):
         kind: ``own_test``, ``left_out``, ``pieces``, ``places``, ``matches`` or ``unit``; of given
             poses and depth maps ``poses`` or ``depth``; of a capture also ``order``, ``scale`` or
             ``size``.
-        message: a sentence for people.
         photos: names of those that it is about, or of the first of them.
     """
 

@@ -17,11 +17,7 @@ def refuse_other_kind(incoming: AnyManifest, published: AnyManifest | None) -> N
     """Refuse a set under the id of a map, and a map under that of a set.
 
     Args:
-        incoming: the version to be published.
         published: any version of the same id in the store; None if there is none.
-
-    Raises:
-        Conflict: ``set.id_is_map``, ``map.id_is_set``.
     """
     if published is None or isinstance(published, SetManifest) == isinstance(incoming, SetManifest):
         return
@@ -30,13 +26,7 @@ def refuse_other_kind(incoming: AnyManifest, published: AnyManifest | None) -> N
 
 
 def refuse_missing_tiles(incoming: AnyManifest, read_manifests: ReadManifests) -> None:
-    """Refuse a set unless the store has each of its tiles with the content that the set names.
-
-    Raises:
-        NotFound: ``set.tile``: a tile is missing.
-        Conflict: ``set.tile``: a tile is a set, or another map; ``set.features``: it has other
-            local features than the set, so that one extraction does not serve all tiles.
-    """
+    """Refuse a set unless the store has each of its tiles with the content that the set names."""
     if not isinstance(incoming, SetManifest):
         return
     manifests = read_manifests([(tile.map, tile.version) for tile in incoming.tiles])
@@ -59,11 +49,7 @@ def refuse_missing_tiles(incoming: AnyManifest, read_manifests: ReadManifests) -
 
 
 def refuse_other_features(ref: str, found: FingerprintRecord, expected: FingerprintRecord) -> None:
-    """Refuse a tile whose local features differ from those of the set.
-
-    Raises:
-        Conflict: ``set.features``.
-    """
+    """Refuse a tile whose local features differ from those of the set."""
     if found != expected:
         raise refuse("set.features", field="tiles", expected=str(expected), got=str(found), ref=ref)
 
@@ -72,12 +58,7 @@ def refuse_if_tile(map_id: str, version: str, current: Iterable[tuple[str, AnyMa
     """Refuse to remove a version that a current set names.
 
     Args:
-        map_id: the map.
-        version: the version that is to be removed.
         current: references and manifests of the current versions.
-
-    Raises:
-        Conflict: ``map.in_set``.
     """
     for ref, manifest in current:
         if isinstance(manifest, SetManifest) and any(

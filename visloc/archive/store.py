@@ -301,9 +301,6 @@ class MapStore:
         """The current sets except ``leaving``; every version of an id whose ``current`` is damaged.
 
         Maps may be among them.
-
-        Raises:
-            Conflict: ``map.in_set`` for a set that cannot be read.
         """
         refs = []
         for map_id in self.ids():
@@ -325,11 +322,7 @@ class MapStore:
 
 
 def open_published(folder: Path) -> Map:
-    """Open the map in a folder ``<id>/<version>``.
-
-    Raises:
-        MapCorrupt: what ``open_map`` finds, or ``map.renamed`` if the folder has another name.
-    """
+    """Open the map in a folder ``<id>/<version>``."""
     opened = open_map(folder)
     refuse_renamed(opened.manifest, str(folder), folder.parent.name, folder.name)
     return opened

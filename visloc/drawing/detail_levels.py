@@ -21,11 +21,7 @@ LANDMARKS_FILE = "landmarks.npy"
 
 
 def read_landmarks(folder: Path, manifest: Manifest) -> NDArray[np.float32]:
-    """Read the landmarks (P, 3) of a map into memory.
-
-    Raises:
-        MapCorrupt: ``map.array``; ``map.range`` for numbers that are not finite.
-    """
+    """Read the landmarks (P, 3) of a map into memory."""
     landmarks = map_array(folder, LANDMARKS_FILE, "<f4", (manifest.counts.landmarks, 3), load=True)
     if not is_finite(landmarks):
         raise refuse("map.range", field=str(folder / LANDMARKS_FILE))

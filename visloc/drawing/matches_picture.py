@@ -128,14 +128,10 @@ def draw_overlay(
         photo: the query. It is drawn in the orientation in which features were extracted.
         opened: the map. Without kept photos, keypoints are drawn on a dark background.
         look: the query's matches with the map.
-        answer: the result.
         inliers: (n,) whether the best pose explains each match.
 
     Returns:
         A JPEG, 1600 pixels wide.
-
-    Raises:
-        MapCorrupt: ``map.photo`` when a photo that the map keeps cannot be decoded.
     """
     rgb, keypoints = _as_looked_at(photo, look)
     query = _fit(rgb.shape[1], rgb.shape[0], (_MARGIN, _HEAD_PX), _QUERY_BOX)
@@ -202,11 +198,7 @@ def _shown(opened: Map, look: Look, query: _Panel) -> Iterator[_Shown]:
 
 
 def read_preview(opened: Map, row: int) -> NDArray[np.uint8] | None:
-    """Decode the small photo (H, W, 3) that a map keeps of a row; None when it keeps none.
-
-    Raises:
-        MapCorrupt: ``map.photo``.
-    """
+    """Decode the small photo (H, W, 3) that a map keeps of a row; None when it keeps none."""
     data = opened.photo(row)
     if data is None:
         return None

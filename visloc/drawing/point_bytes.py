@@ -30,9 +30,6 @@ def read_points(folder: Path, manifest: Manifest, rows: NDArray[np.uint32], firs
         manifest: the map's manifest.
         rows: (k,) rows of the landmarks, in the order in which they are sent.
         first: position of the first of them in the map's ``detail_order``.
-
-    Raises:
-        MapCorrupt: ``map.array``.
     """
     num = manifest.counts.landmarks
     colored = _COLORS_FILE in manifest.files
@@ -47,10 +44,8 @@ def packed_points(opened: Map, order: NDArray[np.uint32], first: int, count: int
     """Pack landmarks of an open map.
 
     Args:
-        opened: the map.
         order: its ``detail_order``.
         first: position in the order to begin at; beyond its end, nothing follows the header.
-        count: maximum number of landmarks.
     """
     rows = order[first : first + count]
     colors = opened.colors

@@ -48,13 +48,7 @@ def passed_over(group: str) -> list[str]:
 def make_plugin(
     group: str, name: str, weights_dir: Path | None, inference: Inference, threads: int | None
 ) -> Any:
-    """Make what a package offers under a name of ``plugin_names``.
-
-    Raises:
-        InvalidInput: ``features.plugin`` when several packages offer the name, when the code of the
-            package fails, or when what it makes is no such feature or has another name.
-        VislocError: what the package itself raises of this kind.
-    """
+    """Make what a package offers under a name of ``plugin_names``."""
     entries = list(entry_points(group=group, name=name))
     packages = sorted(_package(entry) for entry in entries)
     if len(entries) > 1:

@@ -82,7 +82,6 @@ class WorkingResolution:
         """Return that of the photos of a map, one or more.
 
         Args:
-            photos: how finely each of them sees.
             parameters: of the local features.
         """
         most = parameters.get("max_long_side_px")
@@ -96,7 +95,6 @@ class WorkingResolution:
         """Return the width and height at which the features of a photo are to be found.
 
         Args:
-            photo: how finely it sees.
             width: of the photo as stored, pixels.
             height: of the photo as stored, pixels.
             turned: degrees by which it is turned then.
@@ -179,10 +177,7 @@ def extract_features(
 
     Args:
         photo: pixels as stored.
-        extractor: finds the features.
         max_keypoints: strongest ones kept, before the mask drops some of them.
-        read_as: ``STORED`` to find them without turning the photo.
-        extraction: how much effort goes into it.
         framing: how it is resized before, and turned after that.
 
     Returns:

@@ -34,11 +34,7 @@ SUFFIXES: Mapping[FeatureKind, str] = {
 
 
 def feature_file(kind: FeatureKind, image_path: str) -> str:
-    """Return the path of an image's features in their folder.
-
-    Raises:
-        DatasetError: ``kapture.path``.
-    """
+    """Return the path of an image's features in their folder."""
     try:
         return relative_path(image_path) + SUFFIXES[kind]
     except ValueError:

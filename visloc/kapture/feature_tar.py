@@ -16,9 +16,6 @@ def index_tar(path: Path) -> Mapping[str, tuple[int, int]]:
 
     Of two members of one name the last wins, as kapture replaces files by appending. Folders,
     links, and members whose names lead out are ignored; nothing is ever unpacked.
-
-    Raises:
-        DatasetError: ``kapture.tar`` for any other file, or a truncated archive.
     """
     members: dict[str, tuple[int, int]] = {}
     end = 0

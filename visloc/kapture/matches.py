@@ -50,10 +50,6 @@ class MatchFiles:
 
         Files of either order of the two are found. None when there is none, which is not the same
         as a file without a match.
-
-        Raises:
-            DatasetError: with the file: ``kapture.match_values``, ``kapture.feature_size``,
-                ``kapture.feature_too_large``, ``kapture.unreadable``, ``kapture.path``.
         """
         found = self._find(first, second)
         if found is None:
@@ -62,11 +58,7 @@ class MatchFiles:
         return self._rows(name, content)[:, columns]
 
     def digest(self, first: str, second: str) -> str:
-        """Return a hash of the file that ``read`` reads, without looking at its matches.
-
-        Raises:
-            DatasetError: as ``read``, but for the values and the size of the rows.
-        """
+        """Return a hash of the file that ``read`` reads, without looking at its matches."""
         name, _, content = self._find(first, second) or ("", [], b"")
         return hashlib.sha256(name.encode() + b"\0" + content).hexdigest()
 
@@ -145,9 +137,6 @@ def open_matches(folder: Path) -> MatchFiles:
 
     Args:
         folder: ``reconstruction/matches/TYPE`` of a dataset, or such a folder elsewhere.
-
-    Raises:
-        DatasetError: ``kapture.no_matches``, ``kapture.tar``.
     """
     tar = folder / "matches.tar"
     found = MatchFiles(folder, index_tar(tar) if tar.exists() else None)
@@ -166,14 +155,9 @@ def write_matches(
     """Write the matches of one pair, under the name that comes first in the alphabet.
 
     Args:
-        folder: ``reconstruction/matches/TYPE``.
-        first: a photo.
         second: another photo.
         rows: (k, 2) rows of their keypoints.
         scores: (k,); 1 where they are not known.
-
-    Raises:
-        DatasetError: ``kapture.path``.
     """
     if first > second:
         first, second, rows = second, first, rows[:, ::-1]
@@ -187,11 +171,7 @@ def write_matches(
 
 
 def match_file(first: str, second: str) -> str:
-    """Return the path of a pair's file in its folder.
-
-    Raises:
-        DatasetError: ``kapture.path``.
-    """
+    """Return the path of a pair's file in its folder."""
     try:
         return f"{relative_path(first)}{_BETWEEN}{relative_path(second)}{_SUFFIX}"
     except ValueError:

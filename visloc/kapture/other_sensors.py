@@ -28,10 +28,6 @@ def read_other_records(root: Path) -> dict[str, OtherRecords]:
     """Read the records of other sensors by file name; several rows may have one key.
 
     What they measured is not parsed: names of networks are free texts, and may have commas.
-
-    Raises:
-        DatasetError: ``kapture.column_count`` for a row without a value, ``kapture.timestamp``, and
-            for files that cannot be read.
     """
     found = {}
     for name in OTHER_FILES:

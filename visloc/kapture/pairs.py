@@ -33,10 +33,6 @@ def read_pair_rows(path: Path) -> Iterator[PairRow]:
 
     kapture separates them by commas, hloc by blanks. A line with a comma is kapture's, so its names
     may have blanks. Comments and blank lines are ignored; ``./#1.jpg`` is the photo ``#1.jpg``.
-
-    Raises:
-        DatasetError: with file and line; ``kapture.unreadable``, ``kapture.encoding``,
-            ``pairs.column_count``, or ``kapture.number`` for a score that is not a finite number.
     """
     table = Table(Path(), str(path), None)  # so that errors name the whole path
     for fields in table:

@@ -19,14 +19,9 @@ def unroll_rigs(
     Args:
         members: rig id -> id of a sensor or of another rig -> ``member_from_rig``, None if
             unknown. The keys are the rigs.
-        table: ``rigs.txt``, for errors.
 
     Returns:
         rig id -> sensor id -> ``sensor_from_rig``, None if unknown, in the order given.
-
-    Raises:
-        DatasetError: ``kapture.rig_cycle``, ``kapture.rig_depth`` for more than
-            ``MAX_RIG_DEPTH`` levels, ``kapture.duplicate`` if a sensor is twice in a rig.
     """
     subrigs = {rig_id: [m for m in rig if m in members] for rig_id, rig in members.items()}
     try:

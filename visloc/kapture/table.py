@@ -23,7 +23,6 @@ class Table:
     """One text file of a dataset. Iterates over its rows and collects notes about bad ones.
 
     Args:
-        root: folder of the dataset.
         relative: path of the file in it, with forward slashes.
         num_columns: fields of every row; None if rows differ.
     """

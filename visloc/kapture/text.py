@@ -10,11 +10,7 @@ _WINDOWS_DRIVE = re.compile(r"[A-Za-z]:")
 
 
 def relative_path(text: str) -> str:
-    """Normalize the path of a record or image to forward slashes, without ``.`` or doubled ones.
-
-    Raises:
-        ValueError: if it is empty, absolute, contains ``..`` or has control characters.
-    """
+    """Normalize the path of a record or image to forward slashes, without ``.`` or doubled ones."""
     path = PurePosixPath(text.replace("\\", "/"))
     if (
         path.is_absolute()

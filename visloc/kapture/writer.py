@@ -50,12 +50,7 @@ def write_dataset(dataset: Dataset) -> None:
 
 
 def write_rigs(path: Path, rigs: Mapping[str, Mapping[str, Pose | None]]) -> None:
-    """Write a ``rigs.txt``: rig id -> sensor id -> ``sensor_from_rig``.
-
-    Raises:
-        Conflict: ``kapture.exists`` if the file exists.
-        DatasetError: ``kapture.field`` for a text that kapture cannot hold, such as a comma.
-    """
+    """Write a ``rigs.txt``: rig id -> sensor id -> ``sensor_from_rig``."""
     if path.exists() or path.is_symlink():
         raise refuse("kapture.exists", field=str(path))
     text = _text("rigs.txt", _RIG_COLUMNS, _rig_rows(rigs))

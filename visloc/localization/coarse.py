@@ -83,11 +83,7 @@ class _Widening:
 
 
 class CoarsePoses:
-    """Approximates poses in one map; learns the spread when it is first asked.
-
-    Args:
-        geometry: of the map.
-    """
+    """Approximates poses in one map; learns the spread when it is first asked."""
 
     def __init__(self, geometry: MapGeometry) -> None:
         self._geometry = geometry
@@ -105,9 +101,7 @@ class CoarsePoses:
         Args:
             query: unit vector (D,) by global descriptor that ``fusion`` uses.
             retrieved: rows of the map's photos, best first; at least one.
-            fusion: that ranked them.
             evidence: how the photo was turned before it was compared.
-            constraints: the priors of the query.
 
         Returns:
             The pose in the world. None if the map has too few photos to learn a spread from, or if

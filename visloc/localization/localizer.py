@@ -105,16 +105,10 @@ class Localizer:
     """Localizes photos, or features of photos, in one map. Safe to use from several threads.
 
     Args:
-        opened: the map.
         extractor: of its local features; None to localize features only, as in maps of ready-made
             ones.
-        make_descriptor: makes a global descriptor by name.
         make_matcher: makes the network of ``Matcher.LIGHTGLUE`` by the name of local features;
             called by each query that uses it.
-
-    Raises:
-        Conflict: ``map.features`` when the map was built with other features than the installed
-            ones.
     """
 
     def __init__(
@@ -178,13 +172,6 @@ class Localizer:
         Args:
             options: of a query.
             num_cameras: cameras of the rig; 1 for a camera on its own.
-
-        Raises:
-            InvalidInput: ``options.fusion_weights`` of global descriptors that the map does not
-                have; ``options.photos`` that it does not have; ``options.matcher`` when there is
-                none for its local features; ``options.solver`` for a rig of several cameras with
-                ``registration``.
-            WeightsError: when the weights of the matcher are missing or damaged.
         """
         self._fusion(options)
         self._named.rows(options.photos or ())
@@ -208,11 +195,6 @@ class Localizer:
             options: thresholds and the like.
             priors: what is known of the camera.
             cache: features of this photo that localizers of other maps found.
-
-        Raises:
-            InvalidInput: ``camera.size_mismatch``; ``features.required`` when features of the map
-                are not computed here; ``options.fusion_weights`` of global descriptors that it
-                does not have; ``priors.*`` that mean nothing in this map.
         """
         cache = {} if cache is None else cache
         look = self.look(photo, camera, options, priors, cache)
@@ -243,12 +225,6 @@ class Localizer:
             camera: the intrinsics of the photo that the keypoints are of.
             options: thresholds and the like.
             priors: what is known of the camera.
-
-        Raises:
-            InvalidInput: ``camera.required``, ``options.fusion_weights``, ``features.kind``,
-                ``features.keypoints``, ``features.descriptors``, ``features.global_descriptors``,
-                ``priors.*``.
-            TooLarge: ``features.too_many``.
         """
         look = self.look_at_features(features, camera, options, priors)
         return self._answer(look, options, priors)
@@ -333,7 +309,6 @@ class Localizer:
         """Find the pose of one photo that was matched.
 
         Args:
-            look: what the photo shows.
             options: those that it was matched with.
             priors: what is known of the camera.
 

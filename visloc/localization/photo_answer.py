@@ -17,8 +17,6 @@ def photo_answer(
     """State what was solved for one photo.
 
     Args:
-        look: whose matches were solved.
-        solved: of this photo alone.
         origin: (3,) of the map, in the world.
 
     Returns:

@@ -94,11 +94,7 @@ def look_at_one_place(
     """Return what a refused single photo shows of its most promising place.
 
     Args:
-        look: what it shows of the map.
-        reason: of the refusal.
-        geometry: of the map.
         options: those of the query.
-        priors: they exclude mapping photos.
 
     Returns:
         The look with other matches, to be solved and judged like any look; None when no place

@@ -27,7 +27,6 @@ class Rematching:
 
     Attributes:
         network: of the map's local features.
-        geometry: of the map.
         seen: keypoints of the photo, as ``seen_as_found`` gives them.
     """
 

@@ -61,15 +61,7 @@ class SentMatches:
 
 
 def sent_matches(features: QueryFeatures, local: LocalFeatures) -> SentMatches | None:
-    """Return the matches that came with features, checked; None when none did.
-
-    Args:
-        features: what was sent.
-        local: its keypoints and descriptors, checked.
-
-    Raises:
-        InvalidInput: ``features.matches``.
-    """
+    """Return the matches that came with features, checked; None when none did."""
     if not features.matches:
         return None
     by_photo = {}

@@ -71,7 +71,6 @@ class Look:
 
     Attributes:
         evidence: without inliers; its camera is that of the stored pixels.
-        matches: with landmarks.
         landmarks: (n,) int64 rows of the map's landmarks, those of ``matches``.
         elsewhere: matches with landmarks of photos that look more like the query, but that the
             priors exclude; usually none.
@@ -170,16 +169,9 @@ def solve_instant(
     out. If too few matches remain, the pose is refused: ``uncertain_pose``, "send the camera".
 
     Args:
-        images: one of each camera of the rig.
-        geometry: of the map.
         options: those that the images were matched with.
         priors: what is known of the rig.
-        timestamp: for the answer.
         cameras: what earlier instants of a sequence said of their cameras.
-
-    Raises:
-        InvalidInput: ``priors.*`` that mean nothing in this map; ``options.solver`` for several
-            images with ``registration``.
     """
     check_solver(options, len(images))
     constraints = Constraints(geometry, priors)
@@ -233,11 +225,7 @@ def solve_instant(
 
 
 def check_solver(options: LocalizeOptions, num_cameras: int) -> None:
-    """Refuse a solver that cannot take this many images at once.
-
-    Raises:
-        InvalidInput: ``options.solver``.
-    """
+    """Refuse a solver that cannot take this many images at once."""
     if options.solver is Solver.REGISTRATION and num_cameras > 1:
         raise refuse(
             "options.solver",
@@ -342,7 +330,6 @@ def measured_pose(
         found: in the map's own coordinates.
         photo_covariance: (6, 6), from the scatter of the images' matches. The errors of the map
             are added here.
-        geometry: of the map.
     """
     rig_from_local = found.rig_from_world
     whole = geometry.errors.whole(rig_from_local, photo_covariance, found.of_camera)
@@ -367,10 +354,8 @@ def rig_pose(
     """Move a pose from a frame's own coordinates to its world.
 
     Args:
-        rig_from_local: the pose.
         covariance: (6, 6), the errors of the map included.
         origin: (3,) of the frame.
-        source: what the pose rests on.
         uncertainty: which errors ``covariance`` covers.
         photo_covariance: (6, 6), the part of the instant's own images, if they measured the pose.
     """

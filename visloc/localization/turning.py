@@ -55,8 +55,6 @@ class TurnFinder:
     """Looks for the turn in which a map knows photos.
 
     Args:
-        geometry: of the map.
-        extractor: of its local features.
         descriptors: its global descriptors that can be computed, by name.
     """
 
@@ -87,8 +85,6 @@ class TurnFinder:
 
         Args:
             photo: pixels as stored.
-            evidence: of the refusal.
-            reason: of the refusal.
             options: those of the query.
             priors: gravity tells the turn, and others exclude mapping photos.
             cache: features of this photo; those of the turns are added.

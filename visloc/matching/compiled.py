@@ -52,10 +52,6 @@ def nearest_columns(
     Args:
         with_second: whether the second largest products are wanted.
         at_level: the kind of processor to compute for, at most ``level()``; None for that.
-
-    Raises:
-        ValueError: numbers are not int8, or rows have different lengths.
-        MemoryError: there is no memory for a copy of a.
     """
     a, b = np.ascontiguousarray(a), np.ascontiguousarray(b)
     (n, dim), m = a.shape, len(b)

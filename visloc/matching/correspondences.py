@@ -114,7 +114,6 @@ def mutual_nearest_neighbours(
 
     Args:
         a: unit rows except for rounding.
-        b: as a.
         max_ratio: pairs are left out unless their distance is below this part of the distance of
             the row of a to the second nearest row of b (Lowe 2004, section 7.1); None keeps all.
 

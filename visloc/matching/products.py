@@ -51,11 +51,7 @@ class EightBitRows:
 
 
 def round_descriptors(descriptors: NDArray[np.float32]) -> EightBitRows:
-    """Round unit descriptors (n, D) to 8 bits, with one scale so that rows stay comparable.
-
-    Raises:
-        ValueError: entries are not finite.
-    """
+    """Round unit descriptors (n, D) to 8 bits, with one scale so that rows stay comparable."""
     largest = float(max(descriptors.max(initial=0.0), -descriptors.min(initial=0.0)))
     if not np.isfinite(largest):
         raise ValueError("descriptors are not finite")

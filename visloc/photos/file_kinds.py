@@ -19,8 +19,6 @@ class FileKind:
     """A kind of file.
 
     Attributes:
-        name: such as ``HEIC``.
-        plural: how sentences name such files.
         advice: what to do with them instead; empty for photos that are read here.
     """
 

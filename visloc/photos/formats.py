@@ -96,7 +96,6 @@ class PhotoHeader:
     """What a photo says of itself before it is decoded.
 
     Attributes:
-        size: width and height as stored.
         most_pixels: width times height of the largest picture that a decoder may allocate.
         exif_orientation: 1 to 8; for HEIC and AVIF, what their container asks for.
         exif: empty when the photo has none or it is broken.
@@ -122,10 +121,6 @@ def open_header(data: bytes, field: str, max_webp_pixels: float = math.inf) -> P
 
     Args:
         max_webp_pixels: Pillow's reader of WebP sets 8 bytes per pixel aside with the header.
-
-    Raises:
-        InvalidInput: ``image.format`` or ``image.undecodable``.
-        Image.DecompressionBombError: a WebP photo has more pixels, or more than Pillow's own limit.
     """
     kind = file_kind(data[:HEAD_BYTES])
     if kind is None or not kind.is_read:

@@ -126,24 +126,12 @@ _DEFAULT_LIMITS = ImageLimits()
 
 
 def read_photo(data: bytes, limits: ImageLimits = _DEFAULT_LIMITS) -> Photo:
-    """Decode a photo.
-
-    Raises:
-        InvalidInput: ``image.empty``, ``image.format`` (not an image that is read here) or
-            ``image.undecodable`` (malformed or cut off).
-        TooLarge: ``image.too_large``, ``image.too_many_pixels`` or ``image.too_complex``.
-    """
+    """Decode a photo."""
     return _read(data, limits, field="image")
 
 
 def read_photo_file(path: Path, limits: ImageLimits = FILE_LIMITS) -> Photo:
-    """Decode a photo file. At most ``limits.max_bytes`` + 1 bytes of it are read.
-
-    Raises:
-        NotFound: ``image.missing``.
-        InvalidInput: ``image.unreadable``, and as ``read_photo``, with the path as field.
-        TooLarge: as ``read_photo``, with the path as field.
-    """
+    """Decode a photo file. At most ``limits.max_bytes`` + 1 bytes of it are read."""
     try:
         with path.open("rb") as file:
             data = file.read(limits.max_bytes + 1)
@@ -161,16 +149,6 @@ def with_mask(
 
     A mask has the photo's size or aspect, exactly: of its pixels as stored, or, where these lie on
     their side, of the upright picture. An orientation in the mask's own EXIF is ignored.
-
-    Args:
-        photo: without a mask.
-        data: an image of any format that is read.
-        limits: of the mask.
-        field: for errors.
-
-    Raises:
-        InvalidInput: ``mask.size``; ``mask.kind`` for 16 bits or transparency; and what
-            ``read_photo`` raises.
     """
     read = _read(data, limits, field)
     if (unsaid := mask_hides_unsaid(data)) is not None:
@@ -191,22 +169,12 @@ def with_mask(
 
 
 def read_exif(data: bytes) -> Image.Exif:
-    """Return the EXIF of a photo that ``read_photo`` reads; empty when it has none or it is broken.
-
-    Raises:
-        InvalidInput: ``image.format`` or ``image.undecodable``.
-    """
+    """Return the EXIF of a photo that ``read_photo`` reads; empty without any that is whole."""
     return open_header(data, "image").exif
 
 
 def size_as_read(path: Path, limits: ImageLimits = FILE_LIMITS) -> tuple[int, int]:
-    """Return the width and height that ``read_photo_file`` gives a photo, from its header.
-
-    Raises:
-        OSError: when the file cannot be read.
-        InvalidInput: ``image.format`` or ``image.undecodable``, with the path as field.
-        TooLarge: ``image.too_many_pixels``.
-    """
+    """Return the width and height that ``read_photo_file`` gives a photo, from its header."""
     header = open_header(path.read_bytes(), str(path))
     reduced = _reduction(header, limits, str(path))
     return header.size[0] // reduced, header.size[1] // reduced
@@ -314,11 +282,7 @@ def _read(data: bytes, limits: ImageLimits, field: str) -> Photo:
 
 
 def _reduction(header: PhotoHeader, limits: ImageLimits, field: str) -> int:
-    """Return by how much to reduce a photo while it is decoded: 1, 2, 4 or 8.
-
-    Raises:
-        TooLarge: ``image.too_many_pixels``.
-    """
+    """Return by how much to reduce a photo while it is decoded: 1, 2, 4 or 8."""
     pixels = header.most_pixels
     if pixels <= limits.max_pixels:
         return 1
@@ -336,11 +300,7 @@ def _reduction(header: PhotoHeader, limits: ImageLimits, field: str) -> int:
 def _check_passes(
     passes: Passes, header: PhotoHeader, reduced: int, limits: ImageLimits, field: str
 ) -> None:
-    """Refuse a photo that takes too long, or memory for all pixels although it is reduced.
-
-    Raises:
-        TooLarge: ``image.too_complex``.
-    """
+    """Refuse a photo that takes too long, or memory for all pixels although it is reduced."""
     width, height = header.size
     if header.decoded_pixels > _MOST_DECODED_AREA * limits.max_pixels:
         most = _MOST_DECODED_AREA * limits.max_pixels

@@ -78,7 +78,6 @@ class CameraPrior:
         right: of a camera that is as it should be: of the focal length (relative), the principal
             point (longer sides), the radial distortion (coefficient of r^2), and of the shutter
             (motion over all rows: radians, and median depths).
-        wrong: of one that is off.
     """
 
     right: tuple[float, float, float, float]
@@ -124,9 +123,7 @@ class CameraErrors:
     """A rig's pose with cameras that may be off.
 
     Attributes:
-        rig_from_world: with the cameras corrected.
         views: with corrected cameras, and the pixels that a global shutter would have seen.
-        corrected: whether any view was.
         of_camera: (6, 6), what is left of the cameras' errors in ``rig_from_world``, rotation (rad)
             then translation, for R <- Exp(w) R and t <- t + dt.
         evidence: of each view alone; None of one without inliers.
@@ -152,10 +149,8 @@ def find_camera_errors(
 
     Args:
         views: what each camera sees, with all its matches; some may have none.
-        priors: of the camera of each view.
         rig_from_world: the best pose with the cameras as they are.
         earlier: what earlier photos said of the camera of each view.
-        max_error_px: largest reprojection error of an inlier.
         factor: by how much poses in the map are further off than the scatter of matches tells.
 
     Returns:

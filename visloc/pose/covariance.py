@@ -61,7 +61,6 @@ def pose_covariance(
         views: inliers only; some views may have none. Inliers at the very edge of the picture,
             where errors have no derivative, are left out. With an unknown focal length, the
             principal point may be off by a hundredth of the longer side.
-        rig_from_world: the refined pose.
         loss_scale_px: scale c of the loss c^2 / 2 log(1 + r^2 / c^2).
 
     Returns:
@@ -115,7 +114,6 @@ def _of_principal_point(
 
     Args:
         by_point: (6, 2) derivative of the pose by the principal point.
-        views: one of them has inliers.
     """
     (camera,) = (view.camera for view in views if len(view))
     std_px = _PRINCIPAL_POINT_STD * max(camera.width, camera.height)
@@ -180,9 +178,7 @@ def mahalanobis2(
     """Return the squared distance, chi-square with six degrees of freedom; infinite when in doubt.
 
     Args:
-        a: ``device_from_world``.
         covariance_a: (6, 6) of rotation (rad) then translation, for R <- Exp(w) R and t <- t + dt.
-        b: as ``a``.
         covariance_b: of ``b``; its errors are independent of those of ``a``.
     """
     floor = np.diag([_MAP_STD_RAD**2] * 3 + [_MAP_STD**2] * 3)
@@ -226,7 +222,6 @@ def viewpoints_apart(
     Args:
         rotations: (n, 3, 3) camera from world.
         centers: (n, 3) of the cameras.
-        pose: camera from world.
         reach: distance from photos to what they see, above 0.
     """
     cosines = (np.einsum("nij,ij->n", rotations, pose.rotation) - 1.0) / 2.0

@@ -94,18 +94,12 @@ def estimate_generalized_pose(
     Args:
         views: what each camera sees; some may have no correspondences.
         max_error_px: largest reprojection error of an inlier, in each camera's pixels.
-        seed: equal seeds give equal bits.
         gravity: when it is known which way is down.
-        solver: a key of ``SOLVERS``.
 
     Returns:
         The pose. None if there are fewer than four correspondences, if no pose explains four, or
         if no camera has such a focal length. The solver finds a pose in almost anything, so the
         caller must judge the inliers and, with gravity, ``gravity_deviation``.
-
-    Raises:
-        ValueError: a view has not as many pixels as points; there are several with an unknown
-            focal length or for ``registration``.
     """
     checked = _checked(views)
     if any(view.focal_unknown for view in checked):
@@ -129,9 +123,6 @@ def refine_generalized_pose(
     Returns:
         The pose. None if fewer than four correspondences are inliers of the start or of the
         refined pose, or if no camera has such a focal length.
-
-    Raises:
-        ValueError: a view has not as many pixels as points.
     """
     return _best_refined(_checked(views), [rig_from_world], max_error_px)
 

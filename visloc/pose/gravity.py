@@ -87,12 +87,6 @@ def find_upright_poses(
     rays and points, truncated at the threshold plus gravity's own spread (MSAC, Torr and
     Zisserman 2000).
 
-    Args:
-        views: correspondences.
-        gravity: of the rig.
-        max_error_px: largest reprojection error of an inlier.
-        seed: equal seeds give equal bits.
-
     Returns:
         ``rig_from_world`` of the last few poses that were the best so far, best first. They are
         as rough as gravity is: refine them. Empty when no sample gave a pose.

@@ -90,7 +90,6 @@ class _Normal:
         information: (6 + k, 6 + k) for errors of one pixel.
         gradient: (6 + k,)
         variance: px^2 of one coordinate of an error, with what landmarks share of it.
-        num_inliers: of the state.
     """
 
     information: NDArray[np.float64]
@@ -106,11 +105,6 @@ def find_intrinsics(
 
     The loss is the one of ``visloc.pose.refinement``. Inliers are chosen anew in every step, at
     first with a wider threshold.
-
-    Args:
-        view: the camera as given, with all its matches.
-        rig_from_world: the best pose with the given camera.
-        max_error_px: largest reprojection error of an inlier.
 
     Returns:
         With the focal length free, then with the principal point and the aspect free as well. None

@@ -204,7 +204,6 @@ class MapErrors:
     Attributes:
         position_factor: of the standard deviations of the camera's centre; at least 1.
         orientation_factor: of the standard deviations of the rotation about that centre.
-        uncertainty: whether the factors were measured.
         position_std: by how much the map as a whole is bent, along each axis of the world: standard
             deviation, in its unit.
     """

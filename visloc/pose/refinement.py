@@ -69,7 +69,6 @@ def refine(
     Args:
         views: what each camera sees; some may have no correspondences. Where the focal length is
             unknown, it is refined with the pose.
-        start: ``rig_from_world`` so close that its inliers are right.
         max_error_px: largest reprojection error of an inlier, in each camera's pixels.
         max_steps: evaluations of the loss, when the caller can do with less than convergence.
 

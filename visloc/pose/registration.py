@@ -26,11 +26,6 @@ def register(
     here (``visloc.localization.solving`` refuses it). COLMAP also ends the search
     once a pose of the least share of inliers had been found; the gate refuses those anyway.
 
-    Args:
-        view: of one camera.
-        max_error_px: largest reprojection error of an inlier, abs_pose_max_error there.
-        seed: equal seeds give equal bits.
-
     Returns:
         ``rig_from_world`` and (n,) its inliers, or None when there are fewer than four.
     """

@@ -37,7 +37,6 @@ def linearized(
 
     Args:
         views: at least one.
-        rig_from_world: where to linearize.
         about: (3,) the point in the rig's frame that rotations leave in place. The pose changes by
             x <- about + Exp(w) (x - about) + dt: with zero from the left as a whole, as in
             ``visloc.pose.motion``; with the pose's translation by R <- Exp(w) R, t <- t + dt.
@@ -120,7 +119,6 @@ class MatchedView:
     """One camera of a rig and its 2D-3D correspondences; there may be none.
 
     Attributes:
-        camera: intrinsics.
         cam_from_rig: where it sits; the identity for a camera on its own.
         pixels: (n, 2) float64 in the camera's image; those matched best come first, where that is
             known.

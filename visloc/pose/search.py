@@ -43,8 +43,6 @@ def search_with_pycolmap(
     Args:
         views: what each camera sees; those matched best come first.
         max_error_px: largest reprojection error of an inlier, in each camera's pixels.
-        seed: equal seeds give equal bits.
-        max_trials: samples that are tried.
 
     Returns:
         ``rig_from_world`` of the best pose; empty when there is none or fewer than four
@@ -119,8 +117,6 @@ def search_with_focal_length(
 
     Args:
         view: of a camera whose focal length is a guess.
-        max_error_px: largest reprojection error of an inlier.
-        seed: equal seeds give equal bits.
 
     Returns:
         Cameras with ``rig_from_world``; some are far off, with no camera's focal length. Empty when

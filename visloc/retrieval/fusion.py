@@ -196,7 +196,6 @@ class LateFusion:
     """How similarities under several global descriptors become one ranking.
 
     Attributes:
-        operator: a key of ``FUSION_OPERATORS``.
         weights: positive weight by global descriptor, of any sum; descriptors without a weight are
             ignored. None weighs all equally.
         parameter: gamma or beta of the operator, where it has one.
@@ -227,12 +226,7 @@ EQUAL_GHARM = LateFusion()
 def chosen_fusion(
     options: LocalizeOptions, default: LateFusion, names: Iterable[str]
 ) -> LateFusion:
-    """Return the fusion that a query's options ask for, or the map's default.
-
-    Raises:
-        InvalidInput: ``options.fusion_weights`` for a name that is not in the map's ``names``;
-            ``options.fusion_parameter`` for a share above 1.
-    """
+    """Return the fusion that a query's options ask for, or the map's default."""
     known = tuple(names)
     for name in options.fusion_weights or ():
         if name not in known:

@@ -106,12 +106,8 @@ def compare(
     """Compare a query with photos that the caller chose, in the caller's order.
 
     Args:
-        query: as for ``retrieve``.
-        index: as for ``retrieve``.
         photos: (k,) rows of ``index``, best first; those that ``photo_weights`` exclude are left
             out.
-        photo_weights: as for ``retrieve``.
-        fusion: as for ``retrieve``.
     """
     if photo_weights is not None:
         photos = photos[photo_weights[photos] > 0]
@@ -236,11 +232,7 @@ def excluded_photos(
     best to count.
 
     Args:
-        query: as for ``retrieve``.
-        index: as for ``retrieve``.
-        retrieved: the best photos that the priors allow.
         photo_weights: of the priors, 0 for excluded photos; None when there are no priors.
-        fusion: as for ``retrieve``.
     """
     if photo_weights is None:
         return np.empty(0, dtype=np.int64)

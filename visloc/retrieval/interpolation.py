@@ -77,7 +77,6 @@ def joined(
     The cosine of two joined vectors is the weighted mean of their cosines by descriptor.
 
     Args:
-        descriptors: by name.
         weights: positive, of any sum, for each of them; None weighs all equally.
     """
     total = len(descriptors) if weights is None else sum(weights[name] for name in descriptors)

@@ -129,7 +129,6 @@ class InvertedFile:
 
         Args:
             query: unit vector (D,).
-            lists: the lists that are searched, best first.
             count: at least 1.
             allowed: (n,) the rows that may come; None for all.
         """
@@ -158,7 +157,6 @@ class InvertedFile:
 
         Args:
             query: unit vector (D,).
-            lists: the lists that are searched.
             allowed: (n,) the rows that may come; None for all.
             above: only rows with larger cosines are returned.
         """

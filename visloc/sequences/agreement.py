@@ -30,8 +30,6 @@ class Piece:
     """A run of instants in which all measured poses agree with the motion.
 
     Attributes:
-        first: instant.
-        last: instant, inclusive.
         measured: the instants whose measured poses count.
     """
 

@@ -93,7 +93,6 @@ class TracedPose:
     Attributes:
         pose: ``device_from_world``, where the device is a camera or a rig.
         covariance: (6, 6) of rotation (rad) then translation, for R <- Exp(w) R and t <- t + dt.
-        source: how it was found.
         uncertainty: which errors ``covariance`` covers.
         num_inliers: matches that agree with it; 0 for a filled pose.
     """
@@ -181,9 +180,6 @@ def fill_sequence(
             count from the first instant.
         poses: ``device_from_world`` of each instant, of any source; None for a missing pose.
         max_gap_s: seconds; 0 fills nothing.
-
-    Raises:
-        InvalidInput: ``sequence.timestamps`` or ``sequence.max_gap``.
     """
     _check(times_s, max_gap_s)
     if max_gap_s == 0:

@@ -30,8 +30,6 @@ class Group:
     """Instants that agree on a pose.
 
     Attributes:
-        first: instant.
-        last: instant, inclusive.
         reference: instant to which the pose belongs.
         rig_from_world: the pose, as good as the motion is exact.
     """
@@ -51,10 +49,8 @@ def find_groups(
     """Try overlapping groups of instants, small enough for the motion's drift.
 
     Args:
-        instants: the views of N instants.
         links: N - 1 motions.
         registration: the gate, for all images of a group together.
-        seed: equal seeds give equal bits.
     """
     from_first = carried(links)
     for first, last in _spans(instants, links, registration.max_error_px):

@@ -107,10 +107,7 @@ def error_scale(
     information times the covariance: where motions are good, far less than six per instant.
 
     Args:
-        chain: as solved.
-        poses: under which errors are measured.
         covariances: of the poses; None before there are any, when p is taken as 6.
-        loss_scale_px: as in ``solve_chain``.
         error_scale_px2: with which ``covariances`` were computed.
     """
     squares, slopes, used, count = 0.0, 0.0, 0.0, 0

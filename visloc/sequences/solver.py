@@ -97,9 +97,6 @@ class SequenceSolver:
         metric: whether one unit of the map's world is a metre.
         options: those that the images are matched with.
         max_gap_s: longest time between measured instants across which gaps are filled; 0: none.
-
-    Raises:
-        InvalidInput: ``sequence.max_gap``.
     """
 
     def __init__(
@@ -127,11 +124,7 @@ class SequenceSolver:
         self._rest = 0  # instants to come before a window without any pose is searched again
 
     def take(self, seen: SeenInstant, solved: Solved) -> list[InstantAnswer]:
-        """Take one more instant, solved in the frame; return the answers that are final now.
-
-        Raises:
-            InvalidInput: ``sequence.odometry`` for a frame that is not metric.
-        """
+        """Take one more instant, solved in the frame; return the answers that are final now."""
         check_odometry(seen.odometry, metric=self._metric)
         refusal = not_probable_enough(solved.answer, self._options)
         if refusal is not None:
@@ -324,9 +317,7 @@ class SequenceSolver:
         and a tracker that stops, or jumps, is told from a rig that does only by its inertia.
 
         Args:
-            i: the instant.
             around: the nearest supported instant, and the next if there is one.
-            found: the poses of all.
         """
         pose = found[i]
         assert pose is not None  # it hangs on the motion
@@ -383,9 +374,6 @@ class SequenceSolver:
         """Give an answer a pose, unless it contradicts the priors.
 
         Args:
-            answer: of the instant.
-            found: with the errors of the map.
-            priors: of the instant.
             photo_covariance: (6, 6), if the instant's own images measured the pose.
         """
         constraints = PosePriors(self._frame, priors)
@@ -412,20 +400,11 @@ class MapSequenceSolver(SequenceSolver):
     _frame: MapGeometry
 
     def add(self, seen: SeenInstant) -> list[InstantAnswer]:
-        """Take one more instant; return the answers that are final now.
-
-        Raises:
-            InvalidInput: as ``solve``.
-        """
+        """Take one more instant; return the answers that are final now."""
         return self.take(seen, self.solve(seen))
 
     def solve(self, seen: SeenInstant) -> Solved:
-        """Solve an instant on its own, before ``min_probability`` counts, so that maps compare.
-
-        Raises:
-            InvalidInput: ``sequence.odometry`` for a map that is not metric; ``priors.*`` that
-                mean nothing in the map.
-        """
+        """Solve an instant on its own, before ``min_probability`` counts, so that maps compare."""
         check_odometry(seen.odometry, metric=self._metric)
         return solve_instant(
             seen.images,
@@ -438,11 +417,7 @@ class MapSequenceSolver(SequenceSolver):
 
 
 def check_max_gap(max_gap_s: float) -> None:
-    """Refuse a gap that cannot be filled.
-
-    Raises:
-        InvalidInput: ``sequence.max_gap``.
-    """
+    """Refuse a gap that cannot be filled."""
     if not 0 <= max_gap_s <= MAX_GAP_S:  # NaN fails too
         raise refuse(
             "sequence.max_gap",
@@ -458,9 +433,6 @@ def check_odometry(odometry: Odometry | None, *, metric: bool) -> None:
     Args:
         odometry: of an instant; None when there is none.
         metric: whether one unit of the map's world is a metre.
-
-    Raises:
-        InvalidInput: ``sequence.odometry``.
     """
     if odometry is not None and not metric:
         raise refuse("sequence.odometry", field="odometry")

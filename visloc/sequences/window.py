@@ -48,7 +48,6 @@ class WindowInstant:
     Attributes:
         views: one for each image, matched against the map; there may be none.
         alone: the pose that they gave on their own, when it passed the gate.
-        errors: of the map.
     """
 
     views: tuple[MatchedView, ...]
@@ -110,10 +109,8 @@ def solve_window(
     unsure pulls them along by that much.
 
     Args:
-        instants: consecutive, N.
         motions: N - 1, from instant i to i + 1; None where unknown.
         registration: the gate, and the largest reprojection error of an inlier.
-        seed: of RANSAC; equal seeds give equal bits.
 
     Returns:
         For each instant its pose, or None when nothing supports one.

@@ -47,8 +47,6 @@ class SentAs:
     """Hold a value of the core, which is sent as a model of the API's words.
 
     Attributes:
-        model: what is sent.
-        kind: the class of the value.
         read: makes the value of received JSON; may raise what indexing and ``float`` raise.
         write: makes the model of a value.
     """

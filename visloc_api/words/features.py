@@ -78,11 +78,7 @@ class Array(IncomingMessage):
         return Array(dtype=array.dtype.name, shape=list(array.shape), data=array.tobytes())
 
     def to_core(self, field: str, ndim: int) -> NDArray[np.generic]:
-        """Return the array, without copying its bytes.
-
-        Raises:
-            InvalidInput: ``features.dtype``, ``features.shape`` or ``features.data``.
-        """
+        """Return the array, without copying its bytes."""
         dtype = ARRAY_DTYPES.get(self.dtype)
         if dtype is None:
             raise refuse(
@@ -204,11 +200,7 @@ GivenFeatures = Annotated[Features | None, converted(_features_from_text)]
 def query_to_core(
     image: bytes | None, features: Features | None, mask: bytes | None = None
 ) -> bytes | visloc.types.MaskedImage | visloc.types.QueryFeatures:
-    """Return the photo, with its mask if it has one, or the features, whichever was sent.
-
-    Raises:
-        InvalidInput: ``request.query``, ``mask.needs_photo``, or a code of the features.
-    """
+    """Return the photo, with its mask if it has one, or the features, whichever was sent."""
     if mask is not None and image is None:
         raise refuse("mask.needs_photo", field="mask")
     if image is not None and features is None:

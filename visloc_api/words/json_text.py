@@ -25,11 +25,7 @@ _FROM_URL_SAFE = bytes.maketrans(b"-_", b"+/")
 
 
 def check_json_values(text: str | bytes, max_values: int, field: str = "") -> None:
-    """Refuse JSON with too many values before parsing it, which would block all other threads.
-
-    Raises:
-        TooLarge: ``request.too_large``.
-    """
+    """Refuse JSON with too many values before parsing it, which would block all other threads."""
     check_num_values(num_json_values(text), max_values, field)
 
 
@@ -42,11 +38,7 @@ def num_json_values(text: str | bytes) -> int:
 
 
 def check_num_values(values: int, max_values: int, field: str = "") -> None:
-    """Refuse a message of too many values.
-
-    Raises:
-        TooLarge: ``request.too_large``.
-    """
+    """Refuse a message of too many values."""
     if values > max_values:
         raise refuse(
             "request.too_large",
@@ -62,9 +54,6 @@ def check_names(text: str | bytes) -> None:
 
     Args:
         text: JSON that another reader accepted.
-
-    Raises:
-        InvalidInput: ``request.duplicate_field``; ``request.malformed``.
     """
     try:
         json.loads(_shortened(text), object_pairs_hook=check_names_once)
@@ -77,9 +66,6 @@ def check_names_once(fields: list[tuple[str, object]]) -> None:
 
     Args:
         fields: names and values, as ``json`` gives them to its ``object_pairs_hook``.
-
-    Raises:
-        InvalidInput: ``request.duplicate_field``.
     """
     seen: set[str] = set()
     for name, _ in fields:
@@ -89,11 +75,7 @@ def check_names_once(fields: list[tuple[str, object]]) -> None:
 
 
 def utf8_json(text: str | bytes) -> str | bytes:
-    """Return JSON without the byte order mark with which some writers begin (RFC 8259, 8.1).
-
-    Raises:
-        InvalidInput: ``request.malformed`` for UTF-16 and UTF-32.
-    """
+    """Return JSON without the byte order mark with which some writers begin (RFC 8259, 8.1)."""
     if isinstance(text, str):
         return text.removeprefix("\ufeff")
     if b"\0" in text[:4]:
@@ -106,9 +88,6 @@ def bytes_of_base64(text: str) -> bytes:
 
     It may have line ends or no padding, be of the alphabet for URLs, or be a data URL. A blank is
     an error: decoders of forms put it in the place of a plus sign.
-
-    Raises:
-        ValueError: when it is none; ``binascii.Error`` is one.
     """
     text, start = text.strip(), 0
     if text[:5].lower() == "data:":

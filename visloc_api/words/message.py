@@ -79,12 +79,7 @@ class IncomingMessage(_Made):
         """Check a message made of Python values.
 
         Args:
-            value: the message.
             limits: on counts, for the fields that ask for them.
-
-        Raises:
-            InvalidInput: ``request.missing_field``, ``request.unknown_field``,
-                ``request.invalid``, or a code of the field.
         """
         return cls._checked(lambda: cls.model_validate(value, context=limits))
 
@@ -95,14 +90,8 @@ class IncomingMessage(_Made):
         """Check a message written as JSON.
 
         Args:
-            text: the message.
-            limits: as for ``read``.
             max_values: how many values it may have. They are counted by commas and brackets, those
                 in texts too.
-
-        Raises:
-            InvalidInput: as ``read``, ``request.malformed``, ``request.duplicate_field``.
-            TooLarge: ``request.too_large``.
         """
         text = utf8_json(text)
         check_json_values(text, max_values, cls.path.rstrip("."))

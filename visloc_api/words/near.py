@@ -41,11 +41,7 @@ def _near_from_text(value: object) -> object:
 
 
 def near_from_text(text: str) -> Near:
-    """Parse ``latitude,longitude,radius``.
-
-    Raises:
-        InvalidInput: ``near.syntax``.
-    """
+    """Parse ``latitude,longitude,radius``."""
     try:
         latitude, longitude, radius = (float(number) for number in text.split(","))
     except ValueError:

@@ -105,11 +105,7 @@ class Transform(IncomingMessage):
     def checked(
         pose: visloc.geometry.Pose, field: str, rotation_code: str = "pose.rotation"
     ) -> Transform:
-        """Say a pose that nobody has checked yet.
-
-        Raises:
-            InvalidInput: as ``to_core``; for a matrix with a scale too, which the quaternion hides.
-        """
+        """Say a pose that nobody has checked yet."""
         error = np.abs(pose.rotation @ pose.rotation.T - np.eye(3)).max()
         if not (error <= _MAX_SCALE_ERROR and np.linalg.det(pose.rotation) > 0):  # NaN fails too
             raise refuse(
@@ -124,17 +120,7 @@ class Transform(IncomingMessage):
         return transform
 
     def to_core(self, field: str, rotation_code: str = "pose.rotation") -> visloc.geometry.Pose:
-        """Return the transform, checked.
-
-        Args:
-            field: its name, for errors.
-            rotation_code: the code of an error of its rotation.
-
-        Raises:
-            InvalidInput: ``rotation_code`` unless the quaternion has length 1 within 1e-3, which a
-                transform with a scale has not; ``pose.translation`` unless it is three finite
-                numbers within reach.
-        """
+        """Return the transform, checked."""
         length = math.hypot(*self.rotation_wxyz)
         # NaN fails too.
         if len(self.rotation_wxyz) != 4 or not abs(length - 1) <= _MAX_QUATERNION_ERROR:
@@ -159,11 +145,7 @@ class Transform(IncomingMessage):
 
 
 def covariance_to_core(numbers: list[float], field: str) -> NDArray[np.float64]:
-    """Return the checked covariance (6, 6) of a pose.
-
-    Raises:
-        InvalidInput: ``pose.covariance``.
-    """
+    """Return the checked covariance (6, 6) of a pose."""
     covariance = np.array(numbers, dtype=np.float64)
     if covariance.shape == (36,):
         covariance = covariance.reshape(6, 6)
@@ -172,11 +154,7 @@ def covariance_to_core(numbers: list[float], field: str) -> NDArray[np.float64]:
 
 
 def covariance_from_core(covariance: ArrayLike, field: str) -> list[float]:
-    """Say the covariance (6, 6) of a pose that nobody has checked yet.
-
-    Raises:
-        InvalidInput: ``pose.covariance``, with the shape that came where that is wrong.
-    """
+    """Say the covariance (6, 6) of a pose that nobody has checked yet."""
     try:
         array = np.asarray(covariance, dtype=np.float64)
         visloc.priors.check_covariance(array, field)

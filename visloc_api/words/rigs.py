@@ -26,12 +26,7 @@ Timestamp = Annotated[int, Field(ge=-(2**63), lt=2**63)]
 
 @dataclass(frozen=True, slots=True)
 class BatchLimits:
-    """How much one request may hold.
-
-    Attributes:
-        max_images: of one instant.
-        max_instants: of one sequence.
-    """
+    """How much one request may hold."""
 
     max_images: int
     max_instants: int
@@ -87,21 +82,13 @@ class RigCalibration(IncomingMessage):
 
     @staticmethod
     def from_core(sensors: Mapping[str, visloc.types.RigSensor]) -> RigCalibration:
-        """Say the poses of cameras that nobody has checked yet.
-
-        Raises:
-            InvalidInput: ``rig.rotation`` or ``pose.translation``.
-        """
+        """Say the poses of cameras that nobody has checked yet."""
         return RigCalibration(
             sensors={name: _sensor_from_core(name, sensor) for name, sensor in sensors.items()}
         )
 
     def to_core(self) -> Mapping[str, visloc.types.RigSensor]:
-        """Return the rig, checked.
-
-        Raises:
-            InvalidInput: ``rig.empty``, ``rig.rotation``, ``pose.translation`` or ``camera...``.
-        """
+        """Return the rig, checked."""
         if not self.sensors:
             raise refuse("rig.empty", field="rig.sensors", got="none")
         return {name: _sensor_to_core(name, sensor) for name, sensor in self.sensors.items()}
@@ -168,13 +155,7 @@ class RigImage(IncomingMessage):
 
 
 def at_most(limit: str, code: str, field: str) -> BeforeValidator:
-    """Refuse a list that is longer than a limit of ``BatchLimits`` before its parts are validated.
-
-    Args:
-        limit: its name.
-        code: of the refusal.
-        field: the list.
-    """
+    """Refuse a list beyond a limit of ``BatchLimits`` before its parts are validated."""
 
     def check(parts: object, limits: object) -> None:
         if not isinstance(limits, BatchLimits) or not isinstance(parts, list):

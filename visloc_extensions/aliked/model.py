@@ -34,9 +34,6 @@ class Architecture:
 
     Attributes:
         name: the registry's.
-        file_name: of the weights, as published.
-        channels: what the four blocks give.
-        descriptor_dim: length of one descriptor.
     """
 
     name: str
@@ -296,11 +293,7 @@ def _combined(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
 
 
 def read_network(architecture: Architecture, weights_dir: Path | None) -> tuple[AlikedNetwork, str]:
-    """Return the network from the folder or the package, and the sha256 of its weights.
-
-    Raises:
-        WeightsError: the file is missing, damaged, or of another network.
-    """
+    """Return the network from the folder or the package, and the sha256 of its weights."""
     path = find_weights(
         architecture.file_name,
         weights_dir,

@@ -45,8 +45,6 @@ def fates(
     """Return what became of each second of each video, and of each photo of each folder.
 
     Args:
-        captured: the capture.
-        opened: its map.
         astray: names of frames that lie away from their film's others.
         pieces: maps of the photos that nothing links to those of the map.
     """

@@ -51,11 +51,7 @@ def photo_name(seconds: float) -> str:
 def study_video(
     path: Path, work: WorkFolder, most: int, wanted_s: Sequence[float], progress: ItemProgress
 ) -> FilmedVideo:
-    """Look through a video once and choose its frames.
-
-    Raises:
-        InvalidInput: as ``frames_of``; ``capture.still`` when fewer than two frames are chosen.
-    """
+    """Look through a video once and choose its frames."""
     facts = video_facts(path)
     whole = max(1, round(facts.seconds))
     progress(0, whole)  # reading a long video once takes a while, too

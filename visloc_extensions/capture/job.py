@@ -62,7 +62,6 @@ class Outlook:
     """The estimated cost of a capture, shown before the long work.
 
     Attributes:
-        photos: that will be matched.
         minutes: an estimate.
         memory_bytes: an estimate of the peak.
         disk_bytes: an estimate of the work folder, which is removed at the end.
@@ -81,7 +80,6 @@ class Captured:
     """A capture that became a map.
 
     Attributes:
-        folder: of the new version.
         videos: by the name that their photos have in the map.
         photos: names of all photos that were tried.
         notes: on what was left out of the sources or assumed.
@@ -109,17 +107,6 @@ def capture_map(
 
     If it is killed, the same call finds its finished work again. A call whose map is published, and
     which ``Captured.forget`` did not end, returns that map.
-
-    Args:
-        announce: told before the long work.
-
-    Raises:
-        Conflict: ``map.exists`` without ``force``; ``build.running``.
-        InvalidInput: ``map.id``, also for one that leaves no room for the ids of pieces.
-        Unavailable: ``storage.failed`` when the disk is full or broken.
-        NotFound, InvalidInput: ``capture.*`` for sources and lengths that cannot be used; what
-            importers and builds raise.
-        WeightsError: for a network whose weights are missing; nothing was read yet.
     """
     length, marker_m = settings.known_length, settings.marker_m
     if length is not None and marker_m is not None:
@@ -309,11 +296,7 @@ def _resolved(
     videos: Mapping[str, FilmedVideo],
     names: Sequence[str],
 ) -> tuple[str, str, float] | None:
-    """The photos that ``--scale`` names.
-
-    Raises:
-        InvalidInput: ``capture.photo``.
-    """
+    """The photos that ``--scale`` names."""
     if length is None:
         return None
     found = []
@@ -333,11 +316,7 @@ def _resolved(
 
 
 def _with_markers(dataset: Path, marker_m: float, progress: Progress) -> Yardstick:
-    """Look for markers before the long work.
-
-    Raises:
-        InvalidInput: ``capture.no_markers``.
-    """
+    """Look for markers before the long work."""
     photos, _ = collect_photos(
         read_dataset(dataset), posed=False, progress=partial(progress, "photos")
     )

@@ -33,8 +33,6 @@ class Sighting:
     """A marker in a photo.
 
     Attributes:
-        photo: name of the photo.
-        marker: dictionary and number.
         corners: (4, 2) float64 pixels as stored, in order around the marker.
     """
 

@@ -31,7 +31,6 @@ class Yardstick:
 
     Attributes:
         length: names of two photos and the metres between where they were taken; None without.
-        sightings: markers in the photos.
         marker_m: their side; None without markers.
     """
 

@@ -64,18 +64,10 @@ class CaptureSettings:
 
     @property
     def known_length(self) -> KnownLength | None:
-        """The length of ``--scale``.
-
-        Raises:
-            InvalidInput: ``capture.length``.
-        """
+        """The length of ``--scale``."""
         return None if self.scale is None else known_length(self.scale)
 
     @property
     def marker_m(self) -> float | None:
-        """The side of a marker, metres.
-
-        Raises:
-            InvalidInput: ``capture.length``.
-        """
+        """The side of a marker, metres."""
         return None if self.marker_size is None else metres_in(self.marker_size, "--marker-size")

@@ -38,8 +38,6 @@ class Sources:
     """What was named, by kind; each by the name that its photos have in the map.
 
     Attributes:
-        videos: files.
-        folders: of photos.
         exports: scans of apps, and folders or files of nerfstudio's format, with their importers.
         found: names of the videos that were found in folders.
         left_out: videos of folders that cannot be used, by reason.
@@ -57,10 +55,6 @@ def find_sources(paths: Sequence[Path]) -> Sources:
 
     What is named twice counts once, such as a video and the folder that it lies in. Films of Live
     Photos do not count: the photos beside them do.
-
-    Raises:
-        NotFound: ``capture.source`` for what is not there.
-        InvalidInput: ``capture.video`` for a file that is neither a video nor an export.
     """
     videos: dict[str, Path] = {}
     folders: dict[str, Path] = {}
@@ -122,9 +116,6 @@ def study_videos(
 
     Returns:
         The sources without the videos of folders that cannot be used, and the others by name.
-
-    Raises:
-        InvalidInput, TooLarge: as ``study_video``, for a video that was named.
     """
     studied: dict[str, FilmedVideo] = {}
     left_out: dict[str, list[str]] = {}
@@ -144,15 +135,7 @@ def study_videos(
 def read_capture(
     sources: Sources, videos: Mapping[str, FilmedVideo], work: Path, progress: Progress
 ) -> ImportedModel:
-    """Write the frames of videos, and join all sources into one model with one folder of photos.
-
-    Args:
-        videos: by name, as ``sources.videos``.
-        work: a folder; ``photos`` in it is made anew.
-
-    Raises:
-        InvalidInput, DatasetError: what importers raise.
-    """
+    """Write the frames of videos, and join all sources into one model with one folder of photos."""
     photos = work / "photos"
     shutil.rmtree(photos, ignore_errors=True)  # links only
     photos.mkdir(parents=True)

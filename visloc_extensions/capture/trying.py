@@ -55,7 +55,6 @@ def doubts_of_capture(
     """Return what speaks against the map of a capture, beside what its own test finds.
 
     Args:
-        opened: the map.
         films: the videos that it was made of, by name.
         measured: names of the photos of the known length that gives the map its size, if any.
     """

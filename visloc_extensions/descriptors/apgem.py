@@ -68,9 +68,6 @@ def load_apgem(
     """Make AP-GeM from ``Resnet101-AP-GeM-LM18.pt`` in the weights folder; torch computes it.
 
     A file of the same layout without any PCA is whitened on the map instead.
-
-    Raises:
-        WeightsError: the file is missing, damaged, or of another network.
     """
     with torch.serialization.safe_globals(STAND_INS):
         checkpoint = without_training(read_weights(weights_dir, PUBLISHED))

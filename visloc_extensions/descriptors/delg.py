@@ -70,9 +70,6 @@ def load_delg(
     """Make DELG from ``r50_delg_s512.pyth`` in the weights folder; torch computes it.
 
     ResNet-50 or 101, as the tensors say.
-
-    Raises:
-        WeightsError: the file is missing, damaged, or of another network.
     """
     checkpoint = without_training(read_weights(weights_dir, PUBLISHED), *UNUSED)
     layer = checkpoint.tensors.get(f"{LAYER}.weight")

@@ -64,11 +64,7 @@ def load_netvlad(
     _inference: Inference = Inference.AUTO,
     _threads: int | None = None,
 ) -> GlobalDescriptor:
-    """Make NetVLAD from ``mapillary_WPCA4096.pth.tar`` in the weights folder; torch computes it.
-
-    Raises:
-        WeightsError: the file is missing, damaged, or of another network.
-    """
+    """Make NetVLAD from ``mapillary_WPCA4096.pth.tar`` in the weights folder; torch computes it."""
     checkpoint = without_training(read_weights(weights_dir, PUBLISHED))
     whitening = checkpoint.tensors.get("WPCA.0.weight")
     rows = None if whitening is None else whitening.size // (CLUSTERS * FEATURES)

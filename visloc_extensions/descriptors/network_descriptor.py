@@ -97,11 +97,7 @@ def normalized(rgb: NDArray[np.uint8], size: tuple[int, int], device: torch.devi
 
 
 def exponent_of(checkpoint: Checkpoint, name: str) -> float:
-    """Return the learned exponent of a generalized mean from its tensor (1,).
-
-    Raises:
-        WeightsError: ``weights.values`` when it is none.
-    """
+    """Return the learned exponent of a generalized mean from its tensor (1,)."""
     exponent = float(checkpoint.tensors[name][0])
     if not 0.0 < exponent <= MAX_EXPONENT:
         raise refuse(

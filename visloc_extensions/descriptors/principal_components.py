@@ -40,11 +40,7 @@ STAND_INS: list[Callable[..., object] | tuple[Callable[..., object], str]] = [
 
 
 def principal_components(pickled: object) -> PrincipalComponents:
-    """Return what a pickled PCA holds.
-
-    Raises:
-        ValueError: with the reason, when it is not whole or holds numbers that no PCA has.
-    """
+    """Return what a pickled PCA holds."""
     attributes = vars(pickled) if isinstance(pickled, PickledPca) else {}
     mean, components, variances = (
         _array(name, attributes.get(name))

@@ -33,7 +33,6 @@ class Layout:
     """How a state dict names the convolutions, each with its batch norm.
 
     Attributes:
-        stem: the first ones.
         block: what the names in a block begin with, for its stage (from 1) and number.
         first_block: number of the first block in a stage.
         convolutions: the three of a block.

@@ -129,11 +129,7 @@ def write_jpeg(path: Path, rgb: NDArray[np.uint8]) -> None:
 
 
 def video_facts(path: Path) -> VideoFacts:
-    """Read what the container tells.
-
-    Raises:
-        InvalidInput, TooLarge: as ``frames_of``.
-    """
+    """Read what the container tells."""
     with opened_film(path) as (container, stream):
         tags = {**container.metadata, **stream.metadata}
         width, height = square_size(path, stream)
@@ -151,11 +147,6 @@ def frames_of(path: Path) -> Iterator[Frame]:
     """Decode a video's frames in the order in which they are shown.
 
     Frames without a time or not later than the one before, and damaged ones, are passed over.
-
-    Raises:
-        InvalidInput: ``capture.video`` for what is no video or has no video track, or is damaged
-            throughout.
-        TooLarge: ``capture.video_size``, ``capture.video_length``.
     """
     first, last, count, damaged = None, -math.inf, 0, 0
     with opened_film(path) as (container, stream):

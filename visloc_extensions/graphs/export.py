@@ -43,12 +43,7 @@ _PAINTERS = (
 
 
 def export_graph(feature: str, weights_dir: Path) -> Path:
-    """Write the graph of a feature's network beside its weights, and return the path of its XML.
-
-    Raises:
-        InvalidInput: ``features.unknown`` for a feature without such a network.
-        WeightsError: the weights are missing, damaged, or of another network.
-    """
+    """Write the graph of a feature's network beside its weights, and return the path of its XML."""
     if feature not in NETWORKS:
         raise refuse(
             "features.unknown",

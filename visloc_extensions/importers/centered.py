@@ -71,7 +71,6 @@ def _pixels(
     among them, that count from the top-left corner. The model's own geometry tells which.
 
     Args:
-        sensors: the cameras.
         images: the photos; their keypoints are not looked at.
         points: (P, 3) in the world.
         measurements: x to the right and y down from the origin, in pixels.

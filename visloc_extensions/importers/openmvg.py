@@ -50,7 +50,6 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
     are found in them; else the observations become the keypoints.
 
     Args:
-        path: ``sfm_data.json``, or the folder that holds it.
         photos: folder of photos; by default what the file names as ``root_path``, when it exists.
     """
     if path.is_dir():

@@ -66,7 +66,6 @@ def with_features(
 
     Args:
         stems: of each image, the name of its feature files.
-        images: the photos.
         measurements: their observations, in our pixels.
 
     Returns:

@@ -48,10 +48,7 @@ def keypoints_of(
     """Gather the measured features of each image as its keypoints.
 
     Args:
-        measurements: the measurements.
         pixels: (M, 2) their positions in our pixels.
-        num_images: how many images there are.
-        where: the file, for errors.
 
     Returns:
         Per image (n, 2) keypoints, in the order of the feature numbers, and the observations

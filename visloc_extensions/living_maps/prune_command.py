@@ -83,11 +83,7 @@ def prune(
 
 
 def parse_size(text: str, whole: int) -> int:
-    """Return the bytes meant by ``200MB``, ``1.5 GiB``, ``50%`` or a number.
-
-    Raises:
-        InvalidInput: ``prune.max_bytes``.
-    """
+    """Return the bytes meant by ``200MB``, ``1.5 GiB``, ``50%`` or a number."""
     found = _SIZE.fullmatch(text.strip())
     size = 0.0
     if found is not None:

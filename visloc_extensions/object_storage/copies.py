@@ -33,11 +33,7 @@ class Copies:
         return copy
 
     def keep(self, incoming: Path, map_id: str, version: str) -> Path:
-        """Take in a verified version.
-
-        Raises:
-            Conflict: ``map.version_exists`` when another process with the same copies was faster.
-        """
+        """Take in a verified version."""
         with self._folder.changing():
             if self._folder.has_version(map_id, version):
                 raise version_exists(map_id, version)
@@ -53,11 +49,7 @@ class Copies:
         delete()
 
     def make_room(self, size: int) -> None:
-        """Delete the least recently used copies until a map of ``size`` bytes fits.
-
-        Raises:
-            StorageFull: ``maps.storage_full`` when it is larger than the room for all.
-        """
+        """Delete the least recently used copies until a map of ``size`` bytes fits."""
         if size > self._max_bytes:
             raise refuse(
                 "maps.storage_full",

@@ -46,13 +46,7 @@ class Publisher:
         self._has_conditions: bool | None = None
 
     def write(self, folder: Path, map_id: str, version: str) -> None:
-        """Write the files of a version, the manifest last.
-
-        Raises:
-            Conflict: ``map.version_exists`` or ``map.upload_runs`` when another publisher was
-                faster.
-            Unavailable: ``maps.storage_away``.
-        """
+        """Write the files of a version, the manifest last."""
         place = self._storage.path(map_id, version)
         files = {
             path.relative_to(folder).as_posix(): path
@@ -83,10 +77,6 @@ class Publisher:
             map_id: the map's id.
             version: the version's name.
             based_on: the version that must still be current; None for any.
-
-        Raises:
-            Conflict: ``map.outdated``.
-            Unavailable: ``maps.storage_away``.
         """
         target, content = self._storage.path(map_id, CURRENT), f"{version}\n".encode()
         with self._storage.asking():
@@ -150,11 +140,7 @@ class Publisher:
             return hashlib.file_digest(file, "sha256").hexdigest() == sha256_of(path)
 
     def _delete_leftover(self, place: str, map_id: str, version: str) -> None:
-        """Delete an unfinished version to which nobody has added for a long time.
-
-        Raises:
-            Conflict: ``map.version_exists`` if it is finished; ``map.upload_runs`` if it is new.
-        """
+        """Delete an unfinished version to which nobody has added for a long time."""
         found = self._fs.find(place, detail=True)
         if f"{place}/{MANIFEST}" in found:
             raise version_exists(map_id, version)

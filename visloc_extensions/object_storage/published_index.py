@@ -58,9 +58,6 @@ class PublishedIndex:
 
         Args:
             age_s: how old it may be; ``INDEX_S`` when None.
-
-        Raises:
-            Unavailable: ``maps.storage_away`` when nothing is known yet.
         """
         age_s = INDEX_S if age_s is None else min(age_s, INDEX_S)
         maps, now = self._maps, monotonic()

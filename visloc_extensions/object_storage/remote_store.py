@@ -19,10 +19,6 @@ class RemoteMapStore(MapStore):
                 tools read them; any that the URL carries are never shown.
             cache_dir: folder of the copies; several URLs may share it.
             max_cache_bytes: room for copies; the least recently used are deleted first.
-
-        Raises:
-            ImportError: when what the URL needs is not installed.
-            ValueError: for a URL that cannot be used.
         """
         backend = ObjectBackend(url, cache_dir, max_cache_bytes)
         self.root, self.backend = backend.copies.root, backend

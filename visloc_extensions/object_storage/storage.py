@@ -27,12 +27,7 @@ _AT_ONCE = 256  # small objects that are asked for together
 
 
 class Storage:
-    """The objects below one URL.
-
-    Raises:
-        ImportError: when what the URL needs is not installed.
-        ValueError: for a URL that cannot be used.
-    """
+    """The objects below one URL."""
 
     def __init__(self, url: str) -> None:
         if "::" in url:
@@ -101,11 +96,7 @@ class Storage:
 
     @contextmanager
     def asking(self) -> Iterator[None]:
-        """Ask the storage; leave it alone for a while if it does not answer.
-
-        Raises:
-            Unavailable: ``maps.storage_away``.
-        """
+        """Ask the storage; leave it alone for a while if it does not answer."""
         if monotonic() < self.away_until:
             raise self.away("it did not answer a moment ago")
         try:

@@ -25,13 +25,8 @@ def image_bytes(
 
     Args:
         text: base64.
-        image_format: what the reading says.
         size: width and height, for bare pixels.
         max_bytes: largest photo.
-
-    Raises:
-        InvalidInput: ``image.base64``, ``image.empty``, ``image.format``.
-        TooLarge: ``image.too_large``.
     """
     # Before it is decoded: four letters make three bytes, and one in 76 may be a line break.
     if len(text) * 3 // 4 > max_bytes * 78 // 76 + 4:

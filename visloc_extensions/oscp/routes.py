@@ -88,11 +88,7 @@ async def geopose(request: Request) -> Response:
 
 
 def answer_kind(accept: list[str]) -> str:
-    """Return the media type that the Accept headers prefer.
-
-    Raises:
-        InvalidInput: ``geopose.accept`` when they allow no supported type.
-    """
+    """Return the media type that the Accept headers prefer."""
     ranges = [one for header in accept for one in header.split(",") if one.strip()]
     best, best_quality = JSON if not ranges else None, 0.0
     for one in ranges:

@@ -137,13 +137,7 @@ class GeoPoseRequest(_Read):
 
     @classmethod
     def read_json(cls, text: str | bytes) -> Self:
-        """Check a request written as JSON.
-
-        Raises:
-            InvalidInput: ``request.malformed``, ``request.missing_field``, ``request.invalid``,
-                ``request.duplicate_field``.
-            TooLarge: ``request.too_large``.
-        """
+        """Check a request written as JSON."""
         text = utf8_json(text)
         check_json_values(text, MAX_INSTANT_VALUES)
         try:
@@ -185,12 +179,6 @@ class GeoPoseRequest(_Read):
 
         Args:
             max_image_bytes: largest photo.
-            max_images: photos of one instant.
-
-        Raises:
-            InvalidInput: ``geopose.no_camera``, ``image.base64``, ``image.format``, ``near...``,
-                ``camera...``, ``pose...``, ``request.missing_field``.
-            TooLarge: ``image.too_large``, ``rig.too_many_images``.
         """
         sensors = {sensor.id: sensor for sensor in reversed(self.sensors)}
         photos = [

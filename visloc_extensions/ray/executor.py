@@ -20,12 +20,7 @@ _SETTINGS = {
 
 
 def open_ray(workers: int, address: str) -> AbstractContextManager[Executor]:
-    """Return the executor, which ends with its ``with`` block.
-
-    Raises:
-        InvalidInput: ``build.no_ray``.
-        Unavailable: ``build.no_cluster``.
-    """
+    """Return the executor, which ends with its ``with`` block."""
     for setting, value in _SETTINGS.items():
         os.environ.setdefault(setting, value)
     try:

@@ -37,10 +37,6 @@ class RayPool:
 
     Args:
         count: processors to ask for; an autoscaling cluster grows to them.
-        address: ``local``, ``auto``, HOST:PORT or ``ray://HOST:PORT``, as in Ray.
-
-    Raises:
-        Unavailable: ``build.no_cluster``.
     """
 
     def __init__(self, count: int, address: str) -> None:
@@ -80,13 +76,7 @@ class RayPool:
         return self._spent
 
     def run(self, task: Callable[[T], object], items: Sequence[T], progress: ItemProgress) -> None:
-        """Do a task for every item; report progress after each batch.
-
-        Raises:
-            Unavailable: ``build.worker_died`` when a batch ended with its worker every time;
-                ``build.other_version`` when the cluster has another visloc.
-            Exception: what the task raised first; running batches are cancelled.
-        """
+        """Do a task for every item; report progress after each batch."""
         progress(0, len(items))
         batches = iter(in_batches(items))
         shared = ray.put(task)

@@ -38,7 +38,6 @@ class Outlook:
     """The chance of a photo at a pose.
 
     Attributes:
-        expected_inliers: correct matches.
         scatter: standard deviation of the position that the noise of these matches causes, along
             all axes together, units of the world; infinity where so few determine none.
         apart: radians to the nearest mapping photo.
@@ -59,10 +58,8 @@ def outlook_of(
     it by dt changes it by r x w + P dt / d, P projecting at right angles to r.
 
     Args:
-        sight: what is in view.
         expected: (k,) matches expected of each place.
         share: of all places that those in view were drawn from.
-        camera: of the photo.
         noise_px: standard deviation of a match along each axis of the picture.
     """
     total = float(expected.sum()) / share

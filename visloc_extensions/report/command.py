@@ -90,18 +90,8 @@ def write_report(
 
     Finished runs are kept in ``work_dir`` until the report is written.
 
-    Args:
-        target: the HTML file; an existing one is replaced.
-        work_dir: where work in progress is kept, in ``.report``.
-        command: that makes the report again, for the reader.
-
     Returns:
         The contents of the report: ``ReportData`` of ``web/src/report/data.ts``.
-
-    Raises:
-        Conflict: ``map.no_landmarks``; ``report.output`` or ``report.work`` if nothing can be
-            written there; ``report.running``.
-        Unavailable: ``page.not_built``.
     """
     refuse_without_landmarks(opened)
     # Errors that would come at the end are provoked before the long work.
@@ -126,11 +116,7 @@ def write_report(
 
 @contextmanager
 def _work_folder(root: Path) -> Iterator[WorkFolder]:
-    """Hold a folder for finished runs, against another report of the map.
-
-    Raises:
-        Conflict: ``report.running``, ``report.work``.
-    """
+    """Hold a folder for finished runs, against another report of the map."""
     with ExitStack() as held:
         try:
             held.enter_context(exclusive(root.with_name(f"{root.name}.lock")))
@@ -180,11 +166,7 @@ def summary_of_report(data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _begun(target: Path) -> Path:
-    """Make an empty file that will replace the target.
-
-    Raises:
-        Conflict: ``report.output``.
-    """
+    """Make an empty file that will replace the target."""
     unfinished = target.with_name(f".{target.name}.{os.getpid()}.partial")
     try:
         if target.is_dir():

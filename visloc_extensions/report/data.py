@@ -46,10 +46,7 @@ def make_report_data(
     """Measure and predict where a map localizes.
 
     Args:
-        opened: the map; neither photos nor weights are needed.
         work: keeps held-out runs, for a report that was interrupted or is made again.
-        command: that asked for the report.
-        workers: who localizes held-out photos.
         progress: told the stage, how much is done, and of how much.
 
     Returns:

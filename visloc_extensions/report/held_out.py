@@ -39,9 +39,6 @@ def hold_out(
     Finished photos are found again in the work folder.
 
     Args:
-        opened: the map.
-        work: keeps finished photos.
-        workers: where they are localized.
         progress: told how many photos are done, and of how many.
 
     Returns:
@@ -66,11 +63,7 @@ def ask_photos(
     """Do a task for each photo that the work folder does not have yet.
 
     Args:
-        work: where the task keeps its results.
-        workers: where it is done; it travels there.
-        images: rows of the photos.
         key: under which the result of a photo is kept.
-        task: finds and keeps the result of one photo.
         progress: told how many photos are done, and of how many.
 
     Returns:

@@ -22,10 +22,6 @@ def report_page(data: Mapping[str, Any], script: str, style: str) -> str:
     Args:
         data: a ``ReportData`` as ``web/src/report/data.ts`` has it; numbers must be finite.
         script: the built viewer, which reads the data from the element ``report``.
-        style: its style sheet.
-
-    Raises:
-        Unavailable: ``page.not_embeddable``, if the built files cannot stand inside a page.
     """
     script, style = _embeddable(script, "script"), _embeddable(style, "style")
     policy = (

@@ -42,7 +42,6 @@ class LookAlike:
         image: row of the map's photos.
         twin: row of the photo nearest to where it was found.
         position: (3,) float64 where it was found, relative to the map's origin.
-        inliers: there.
         own_inliers: matches that are right with the photo's own pose, in the map without the photo.
     """
 
@@ -66,7 +65,6 @@ class Search:
     """The result of asking a map for places that look alike.
 
     Attributes:
-        found: pairs of places.
         asked: the number of photos that were asked. A photo that shares its place with all others
             cannot be.
     """
@@ -97,11 +95,7 @@ def find_look_alikes(
     """Find places that look alike; each pair of places once, at most a dozen.
 
     Args:
-        opened: the map.
-        viewpoints: of its photos.
         runs: of held-out photos; some of these photos are asked.
-        work: keeps finished photos.
-        workers: where they are asked.
         progress: told how many photos are done, and of how many.
 
     Returns:

@@ -34,7 +34,6 @@ class Forecast:
     """The prediction for a photo at a pose.
 
     Attributes:
-        sight: what is in view.
         outlook: what of it is expected to be found again, and how well that determines the pose.
         probability: that it is localized well.
         position_std: where it is localized, units of the world; infinity where so little is in
@@ -63,7 +62,6 @@ class CoverageModel:
 
         Args:
             pose: ``cam_from_local``, relative to the map's origin.
-            camera: of the photo.
         """
         sight = look_around(self.places, self.viewpoints, pose, camera)
         outlook = _outlook(sight, self.rematch, self.places, camera, self.noise_px)
@@ -109,10 +107,7 @@ def learn(
     no run of its group.
 
     Args:
-        opened: the map.
-        viewpoints: of its photos.
         runs: may be none: then the model knows what was thought before.
-        within: what counts as localized.
         progress: told how many runs were looked at, and of how many.
     """
     places = sample_places(opened, viewpoints)

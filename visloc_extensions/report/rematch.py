@@ -73,7 +73,6 @@ def count(sight: Sight, matches: NDArray[np.int64]) -> Counted:
     """Count the places in view of one run.
 
     Args:
-        sight: of its pose, without what was left out.
         matches: (k,) correct matches with each.
     """
     kind = np.zeros(len(sight), dtype=np.int64)

@@ -78,10 +78,7 @@ def look_around(
     """Find what is in view at a pose, as the photos near it know it.
 
     Args:
-        places: of the map.
-        viewpoints: of its photos.
         pose: ``cam_from_local``, relative to the map's origin.
-        camera: of the photo.
         absent: what is not in the map.
     """
     apart = viewpoints.apart_from(pose)

@@ -36,9 +36,7 @@ class WeakSpot:
     """A place and a direction to take more photos.
 
     Attributes:
-        cell: of the grid.
         direction: row of the grid's directions.
-        why: in words.
     """
 
     cell: int
@@ -57,11 +55,7 @@ def find_weak_spots(
     """Find where a query is likely, but not to be localized; the greatest loss first.
 
     Args:
-        grid: where was looked.
         plan: its frame.
-        forecasts: by cell and direction.
-        model: that they come from.
-        within: what counts as localized.
         unit: of the world, for people, with a blank before it; "" for none.
     """
     viewpoints = model.viewpoints

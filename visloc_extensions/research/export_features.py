@@ -53,16 +53,11 @@ def export_features(
 
     Args:
         output: folder to make, or one that an earlier run with the same settings left.
-        local_features: a name of ``visloc.features.LOCAL_FEATURES``.
-        max_keypoints: strongest keypoints kept per photo.
         global_from: a map whose global descriptors are computed for the photos. Its local
             features must be the same and as many, because ``localvlad`` is made of them.
 
     Returns:
         The names of photos that are listed but absent; they have no features.
-
-    Raises:
-        Conflict: ``map.features``, ``export.other_dataset``, ``export.other_settings``.
     """
     dataset = read_dataset(dataset_root)
     extractor = make_local_features(local_features, weights_dir, inference)

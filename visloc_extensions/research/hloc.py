@@ -41,16 +41,10 @@ def import_features(
     Args:
         files: HDF5 files, in any order. The names of matched photos are those of the features.
         output: gets ``reconstruction/KIND/TYPE``; keypoints count from the corner of the picture.
-        type_name: TYPE.
 
     Returns:
         How many photos have local and global features, and how many pairs have matches; and a note
         on what is not read.
-
-    Raises:
-        InvalidInput: ``hloc.h5py``.
-        DatasetError: ``hloc.unreadable``, ``hloc.group``, ``hloc.pair``, ``hloc.nothing``.
-        Conflict: as ``write_local_features``.
     """
     if importlib.util.find_spec("h5py") is None:
         raise refuse("hloc.h5py")

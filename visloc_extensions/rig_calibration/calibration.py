@@ -61,8 +61,6 @@ class RelativePose:
     """One camera in the frame of another, estimated over instants.
 
     Attributes:
-        pose: ``cam_from_other``.
-        instants: how many samples there were.
         outliers: those further off than ``OUTLIER_MULTIPLE`` times the median, in rotation or in
             position.
         rotation_deg: deviation of the rotations, degrees.
@@ -81,7 +79,6 @@ class MountedCamera:
     """A camera of a calibrated rig.
 
     Attributes:
-        cam_from_rig: its place.
         relative_to: the camera that it was compared with; None for the reference camera.
         relative: how they compared; None for the reference camera.
     """
@@ -96,9 +93,7 @@ class RigCalibration:
     """A rig whose frame is that of its reference camera.
 
     Attributes:
-        rig: its id.
         reference: id of the camera at the identity.
-        cameras: by id, the reference first.
         notes: what a reader should know, one sentence each.
     """
 
@@ -121,17 +116,9 @@ def calibrate_rig(
     so on: of all chains, the one whose links rest on most instants.
 
     Args:
-        dataset: photos with poses; equal timestamps are one instant.
-        rig: id of the rig.
         reference: the camera that is the frame of the rig; None: the one that shares most instants
             with the others, of equal ones the first by id.
         cameras: ids of its cameras; None: all cameras of the dataset.
-
-    Raises:
-        InvalidInput: ``rig.id``, ``rig.cameras`` or ``rig.reference`` for a setting that does not
-            fit; ``TooLarge`` ``rig.too_many_cameras``.
-        DatasetError: ``rig.unconnected`` for cameras with too few instants in common;
-            ``rig.not_rigid`` for cameras that move against each other.
     """
     if not rig or rig in dataset.sensors:
         raise refuse(
@@ -167,22 +154,13 @@ def calibrate_rig(
 
 
 def refuse_known_rigs(output: Path) -> None:
-    """Refuse to write rigs where there is something.
-
-    Raises:
-        Conflict: ``rig.exists``.
-    """
+    """Refuse to write rigs where there is something."""
     if output.exists() or output.is_symlink():
         raise refuse("rig.exists", field=str(output))
 
 
 def write_calibration(calibration: RigCalibration, output: Path) -> None:
-    """Write a rig as kapture's ``rigs.txt``, complete or not at all.
-
-    Raises:
-        Conflict: ``rig.exists``.
-        DatasetError: ``kapture.field`` for an id that kapture cannot hold.
-    """
+    """Write a rig as kapture's ``rigs.txt``, complete or not at all."""
     refuse_known_rigs(output)
     members = {name: one.cam_from_rig for name, one in calibration.cameras.items()}
     write_rigs(output, {calibration.rig: members})

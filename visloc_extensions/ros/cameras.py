@@ -20,9 +20,6 @@ def camera_from_info(info: Any, topic: str, *, rectified: bool = False) -> Camer
 
     ``plumb_bob`` and ``rational_polynomial`` are OpenCV's model of up to 8 numbers, ``equidistant``
     its fisheye model of 4 (sensor_msgs/distortion_models). Zeros at the end mean nothing.
-
-    Raises:
-        DatasetError: ``bag.camera``: a model we lack, a region beyond the sensor; ``camera.*``.
     """
     k, d, p = (  # ROS 1 wrote them in capitals
         np.asarray(getattr(info, name.upper() if hasattr(info, name.upper()) else name), np.float64)

@@ -71,10 +71,6 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
     Args:
         path: a ``.bag`` of ROS 1, or the folder of a ROS 2 bag.
         photos: the folder that the photos are written to; None makes ``<bag>_photos`` beside it.
-
-    Raises:
-        DatasetError: ``bag.*``; ``bag.no_photos`` if no topic holds photos.
-        Unavailable: ``bag.no_rosbags``.
     """
     with open_bag(path) as bag:
         bag.check_has_photos()

@@ -31,7 +31,6 @@ class Picture:
     """A photo of a bag: an encoded file, or pixels.
 
     Attributes:
-        topic: where it was published.
         time_ns: of the header, when it was taken.
         frame: the camera's optical frame, without a leading slash.
         encoded: the file as published (JPEG or PNG); None for raw pictures.
@@ -64,11 +63,7 @@ def has_known_colors(message: Any) -> bool:
 
 
 def pixels_of(message: Any, topic: str) -> NDArray[np.uint8]:
-    """Return the pixels of an ``Image``, (H, W, 3) RGB or (H, W) grey.
-
-    Raises:
-        DatasetError: ``bag.picture``: an encoding that we lack, or too few bytes.
-    """
+    """Return the pixels of an ``Image``, (H, W, 3) RGB or (H, W) grey."""
     if message.encoding not in _COLORS:
         raise refuse("bag.picture", field=topic, expected=_COLORS, got=message.encoding)
     channels, order = _COLORS[message.encoding]
@@ -77,11 +72,7 @@ def pixels_of(message: Any, topic: str) -> NDArray[np.uint8]:
 
 
 def depth_in_metres(message: Any, topic: str) -> NDArray[np.float32]:
-    """Return the depth of an ``Image``, (H, W); 0 where there is none (REP 118).
-
-    Raises:
-        DatasetError: ``bag.picture``: an encoding that is no depth, or too few bytes.
-    """
+    """Return the depth of an ``Image``, (H, W); 0 where there is none (REP 118)."""
     if message.encoding not in _DEPTHS:
         raise refuse("bag.picture", field=topic, expected=_DEPTHS, got=message.encoding)
     kind = np.dtype(_DEPTHS[message.encoding])

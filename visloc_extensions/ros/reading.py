@@ -27,9 +27,7 @@ class Bag:
     """An open bag.
 
     Attributes:
-        path: the file or folder.
         photos: topics of photos; without compressed copies of others.
-        depth: topics of depth pictures.
         left_out: other topics of pictures, and why: their encoding, such as Bayer patterns, or
             their camera.
         cameras: intrinsics by topic of photos or depth; None where the bag does not say.
@@ -68,11 +66,7 @@ class Bag:
         ]
 
     def pictures(self, topics: Sequence[str]) -> Iterator[Picture]:
-        """Read the photos of some topics, in the order of the bag.
-
-        Raises:
-            DatasetError: ``bag.picture``; ``bag.unreadable``: a message cannot be decoded.
-        """
+        """Read the photos of some topics, in the order of the bag."""
         with _reading(self.path):
             for topic, message in self.messages(topics):
                 time_ns, frame = _stamp(message), _frame(message.header.frame_id)
@@ -86,11 +80,7 @@ class Bag:
         return sum(each.msgcount for each in self._reader.connections if each.topic in topics)
 
     def messages(self, topics: Sequence[str]) -> Iterator[tuple[str, Any]]:
-        """Read the messages of some topics, in the order of the bag.
-
-        Raises:
-            DatasetError: ``bag.unreadable``: a message cannot be decoded.
-        """
+        """Read the messages of some topics, in the order of the bag."""
         chosen = [each for each in self._reader.connections if each.topic in topics]
         if chosen:
             with _reading(self.path):
@@ -102,10 +92,6 @@ def open_bag(path: Path) -> Iterator[Bag]:
     """Open a ROS 1 bag (a file) or a ROS 2 bag (a folder; SQLite or MCAP).
 
     The whole bag is read once for transforms, but no photo is kept.
-
-    Raises:
-        DatasetError: ``bag.unreadable``.
-        Unavailable: ``bag.no_rosbags``.
     """
     try:
         from rosbags.highlevel import AnyReader
@@ -131,9 +117,6 @@ def _reading(path: Path) -> Iterator[None]:
 
     Its bytes go through databases, decompressors and decoders that are made of the types that the
     bag itself describes. Each has exceptions of its own.
-
-    Raises:
-        DatasetError: ``bag.unreadable``.
     """
     try:
         yield

@@ -23,7 +23,6 @@ class PoseStamped:
 
     Attributes:
         time_ns: of the photo.
-        device_from_world: the pose.
         covariance: (6, 6) of (w, dt), as answers state it.
     """
 
@@ -53,10 +52,6 @@ def write_poses(
     Args:
         path: a file for ROS 1, a folder for ROS 2; it must not exist.
         frame: the frame that the poses are in, such as ``map``.
-
-    Raises:
-        Conflict: ``bag.exists``.
-        Unavailable: ``bag.no_rosbags``.
     """
     try:
         from rosbags import rosbag1, rosbag2

@@ -56,11 +56,7 @@ class ScanFrame:
 
 
 def arkit_pose(values: ArrayLike, where: str) -> Pose:
-    """Return ``cam_from_world`` of a matrix camera to world (3 or 4 rows of 4) of ARKit.
-
-    Raises:
-        DatasetError: ``import.scan_pose``.
-    """
+    """Return ``cam_from_world`` of a matrix camera to world (3 or 4 rows of 4) of ARKit."""
     matrix = np.asarray(values, np.float64).reshape(-1, 4)
     rotation = rotation_from_matrix(matrix[:3, :3])
     if rotation is None:
@@ -69,11 +65,7 @@ def arkit_pose(values: ArrayLike, where: str) -> Pose:
 
 
 def quaternion_pose(values: Sequence[float], where: str) -> Pose:
-    """Return ``cam_from_world`` of x y z w of the rotation camera to world, and the position.
-
-    Raises:
-        DatasetError: ``pose.rotation``.
-    """
+    """Return ``cam_from_world`` of x y z w of the rotation camera to world, and the position."""
     try:
         return Pose.from_quaternion([values[3], *values[:3]], values[4:]).inverse()
     except InvalidInput as error:
@@ -81,11 +73,7 @@ def quaternion_pose(values: Sequence[float], where: str) -> Pose:
 
 
 def pinhole(params: Sequence[float], size: tuple[int, int], where: str) -> Camera:
-    """Return the camera of fx, fy, cx, cy in pixels of a picture.
-
-    Raises:
-        DatasetError: ``import.scan_camera`` for the intrinsics of another size; ``camera.*``.
-    """
+    """Return the camera of fx, fy, cx, cy in pixels of a picture."""
     try:
         camera = Camera("PINHOLE", *size, tuple(params))
     except InvalidInput as error:

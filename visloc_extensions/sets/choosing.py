@@ -64,18 +64,11 @@ def allowed_tiles(
     around a band.
 
     Args:
-        outline: the set.
         priors: in the set's frame.
         within: (T,) the requested tiles; None for all.
 
     Returns:
         (T,) at least one is True.
-
-    Raises:
-        InvalidInput: ``priors.maps`` for a name that is no tile; ``priors.height`` when neither the
-            set nor the priors define which way is down; ``priors.gnss`` when the set does not know
-            where it lies on Earth.
-        NotFound: ``set.no_tile``.
     """
     low, high = outline.photo_boxes[:, 0], outline.photo_boxes[:, 1]
     allowed = np.ones(len(low), np.bool_) if within is None else within.copy()
@@ -116,12 +109,8 @@ def nearest_tile(
     first one.
 
     Args:
-        outline: the set.
         priors: in the set's frame; they exclude every tile.
         within: (T,) the requested tiles; None for all.
-
-    Raises:
-        NotFound: ``set.no_tile`` when no requested tile is named.
     """
     asked = allowed_tiles(outline, Priors(maps=priors.maps), within)
     center = None

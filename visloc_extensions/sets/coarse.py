@@ -95,13 +95,8 @@ def rank_tiles(
     """Rank tiles by the similarity of their photos to a query, best first, at most 50.
 
     Args:
-        map_set: the set.
         local: the query's features.
         allowed: (T,) the tiles that may be ranked; None for all.
-
-    Raises:
-        Conflict: ``map.features`` for an index made with another revision of the descriptor.
-        MapCorrupt: ``map.array`` for a vocabulary of other local features.
     """
     check_descriptor(map_set)
     dim, expected = local.descriptors.shape[1], map_set.coarse.model["vocabulary"].shape[1]
@@ -119,11 +114,7 @@ def rank_tiles(
 
 
 def check_descriptor(map_set: MapSet) -> None:
-    """Refuse an index made with another revision of the descriptor.
-
-    Raises:
-        Conflict: ``map.features``.
-    """
+    """Refuse an index made with another revision of the descriptor."""
     check_fingerprint(map_set.coarse.fingerprint, localvlad().fingerprint, map_set.ref)
 
 
@@ -162,9 +153,7 @@ def score_without(
     """Score a tile as ``ranked`` does, but without some of its photos.
 
     Args:
-        coarse: the index.
         query: descriptor (D,).
-        tile: row of the tile.
         left_out: (k,) rows of the tile's photos, not all of them.
     """
     return _score(coarse, tile, query @ coarse.model["rotation"], left_out)

@@ -32,8 +32,6 @@ def learn(open_tile: Callable[[int], Map], num_tiles: int, *, seed: int = 0) -> 
     Args:
         open_tile: opens a tile of the set by its row; called a few times for each, with one tile
             open at a time.
-        num_tiles: number of tiles.
-        seed: for the sample, the vocabulary and the rotation.
     """
     random = np.random.default_rng(seed)
     teachers = np.sort(
@@ -67,7 +65,6 @@ def learn_of_words(
 
     Args:
         read_words: returns the local descriptors (n, d) of a photo by its number; called twice.
-        num_photos: number of photos.
         random: for the sample of the descriptors, and the rotation.
     """
     descriptor = localvlad()

@@ -75,11 +75,7 @@ def split(
 
 
 def _length(option: str, text: str, metric: bool) -> float:
-    """A length in units of the map.
-
-    Raises:
-        InvalidInput: ``split.tile`` or ``split.overlap``.
-    """
+    """A length in units of the map."""
     match = re.fullmatch(r"([0-9]*\.?[0-9]+)(m?)", text.strip())
     if match is None or (match[2] and not metric):
         raise refuse(

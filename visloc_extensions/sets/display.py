@@ -82,12 +82,7 @@ def verify_tiles(opened: MapSet, maps_dir: Path | None) -> None:
     """Compare the coarse index's features with ours, and the tiles with those in the store.
 
     Args:
-        opened: the set, verified.
         maps_dir: the store; None where the set is a folder alone.
-
-    Raises:
-        Conflict: ``map.features``, ``set.tile``, ``set.features``.
-        NotFound: ``set.tile``.
     """
     num_files = len(opened.manifest.files)
     say(f"{opened.ref}: {num_files} files, every byte as published")

@@ -119,13 +119,7 @@ def write_set(folder: Path, content: SetContent, *, set_id: str, version: str, c
 
 
 def open_set(folder: Path) -> MapSet:
-    """Open a set after checking its manifest and the presence and size of its files.
-
-    Raises:
-        MapCorrupt: with the file that is wrong.
-        InvalidInput: ``set.is_map``.
-        Conflict: ``set.index`` for a set of a format before 2.0.
-    """
+    """Open a set after checking its manifest and the presence and size of its files."""
     outline = read_set_outline(folder)
     manifest = outline.manifest
     check_files(folder, manifest)
@@ -166,11 +160,7 @@ def open_set(folder: Path) -> MapSet:
 
 
 def open_published_set(folder: Path) -> MapSet:
-    """Open the set in a folder ``<id>/<version>``.
-
-    Raises:
-        MapCorrupt: what ``open_set`` finds, or ``map.renamed`` if the folder has another name.
-    """
+    """Open the set in a folder ``<id>/<version>``."""
     opened = open_set(folder)
     refuse_renamed(opened.manifest, str(folder), folder.parent.name, folder.name)
     return opened
@@ -180,9 +170,6 @@ def verify_set(folder: Path) -> MapSet:
     """Open a set and read every byte of it: checksums, then ranges.
 
     ``MapStore.publish`` checks its tiles.
-
-    Raises:
-        MapCorrupt: with the file and what is wrong.
     """
     opened = open_set(folder)
     check_checksums(folder, opened.manifest)

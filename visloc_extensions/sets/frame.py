@@ -15,13 +15,7 @@ from visloc.types import CoarsePose, InstantAnswer, RigPose
 
 
 def answer_in_set(answer: InstantAnswer, set_from_tile: Similarity, set_ref: str) -> InstantAnswer:
-    """Move the poses and the rig of a tile's answer to the set's frame and unit.
-
-    Args:
-        answer: of the tile.
-        set_from_tile: transform of the tile.
-        set_ref: ``id@version`` of the set, which candidates then name.
-    """
+    """Move the poses and the rig of a tile's answer to the set's frame and unit."""
     images = tuple(
         replace(image, cam_from_rig=scaled_device(image.cam_from_rig, set_from_tile.scale))
         for image in answer.images
@@ -49,9 +43,6 @@ def down_in_set(priors: Priors, down: NDArray[np.float64] | None) -> NDArray[np.
     Args:
         priors: in the set's frame.
         down: (3,) the set's own direction; None when unknown.
-
-    Raises:
-        InvalidInput: ``priors.height`` when neither the set nor the priors define it.
     """
     if priors.height is None:
         return None
@@ -75,11 +66,7 @@ def priors_in_tile(
 
     Args:
         priors: in the set's frame; a GNSS prior is ``located``.
-        set_from_tile: transform of the tile.
         down: (3,) the set's own direction; None when unknown.
-
-    Raises:
-        InvalidInput: ``priors.height``, as ``down_in_set``.
     """
     tile_from_set = set_from_tile.inverse()
     scale, position, height = tile_from_set.scale, priors.position, priors.height

@@ -38,7 +38,6 @@ def mistaken_for(
     Args:
         open_tile: opens a tile by its row.
         boxes: (T, 2, 3) of the tiles' photos in the set.
-        coarse: the index.
     """
     most = max(1, min(_OF_A_TILE, _IN_ALL // len(boxes)))
     found: list[tuple[int, ...]] = []

@@ -21,11 +21,7 @@ def read_poses(path: Path, refs: Sequence[str]) -> list[tuple[str, Similarity]]:
     Blank lines, and what follows ``#``, do not count.
 
     Args:
-        path: the file.
         refs: of the maps as they were given; each has one line, under the same name.
-
-    Raises:
-        InvalidInput: ``set.poses`` with the line, and what ``Pose.from_quaternion`` raises.
     """
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
@@ -64,11 +60,7 @@ def poses_on_earth(store: MapStore, refs: Sequence[str]) -> list[tuple[str, Simi
     The frame has metres east, north and up of the first map's origin on Earth.
 
     Args:
-        store: holds the maps.
         refs: of the maps, at least one.
-
-    Raises:
-        InvalidInput: ``set.poses`` for a map that is not tied to the Earth.
     """
     places = [_place(store, ref) for ref in refs]
     return [

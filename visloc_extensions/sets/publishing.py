@@ -66,7 +66,6 @@ class _Placed:
     """A map as a tile.
 
     Attributes:
-        features: its local features.
         metric: whether its own unit is a metre.
         down: (3,) in the set's frame; None where the map does not know it.
         anchor: what its world rests on, in the set's frame.
@@ -100,22 +99,13 @@ def publish_set(
     - It knows where it lies on Earth if one of its maps does. The first of these counts.
 
     Args:
-        store: holds the maps.
         set_id: the set's id.
         tiles: ``id`` or ``id@version`` of each map, and where it lies in the set's frame.
-        progress: told how far each stage is.
         notes: what should be known of the set.
         model: of a coarse index whose tiles had the same local features; None to learn one.
 
     Returns:
         The folder of the version; of the current one when that is the same set already.
-
-    Raises:
-        InvalidInput: ``map.is_set`` for a tile that is a set, ``set.tiles`` without any, or for one
-            that is named twice.
-        Conflict: ``set.features``, ``set.scale``, ``set.gravity``, ``set.anchor``: maps that
-            contradict each other; ``set.id_is_map``; and what ``MapStore.publish`` raises.
-        NotFound: ``map.unknown``, ``map.version``.
     """
     checked_name(set_id, "set")
     _refuse_number(len(tiles))
@@ -160,11 +150,7 @@ def _refuse_number(num_tiles: int) -> None:
 
 
 def refuse_map_of_this_name(store: MapStore, set_id: str, field: str) -> None:
-    """Refuse the id of a map for a set, before the long part.
-
-    Raises:
-        Conflict: ``set.id_is_map``.
-    """
+    """Refuse the id of a map for a set, before the long part."""
     with suppress(NotFound, MapCorrupt):
         if not isinstance(read_any_manifest(store.folder(set_id)), SetManifest):
             raise refuse("set.id_is_map", field=field, got=set_id)

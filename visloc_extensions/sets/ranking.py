@@ -54,7 +54,6 @@ def resolution_beside(opened: MapSet, folder: Path) -> WorkingResolution | None:
     """Return how finely the largest tile of a set sees.
 
     Args:
-        opened: the set.
         folder: its version's, ``<id>/<version>`` beside those of its tiles.
 
     Returns:
@@ -73,13 +72,8 @@ class TileRanker:
     """An open set in a worker process: it ranks tiles, and puts sequences in order.
 
     Args:
-        opened: the set.
         extractor_of: returns the extractor of its local features.
         resolution: how finely its tiles see; None to find features in photos of any size.
-
-    Raises:
-        Conflict: ``map.features`` when the set's maps were built with other features than those
-            that are installed.
     """
 
     def __init__(
@@ -184,7 +178,6 @@ class TileRanker:
         Invalid features rank no tile; the tile that is searched reports the error.
 
         Args:
-            decoded: the query.
             options: how features are found.
             allowed: (T,) the tiles to rank; None to find features only.
         """

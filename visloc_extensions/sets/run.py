@@ -155,7 +155,6 @@ def solved_in_set(
 
     Args:
         solved: relative to the origin of the tile.
-        set_from_tile: transform of the tile.
         tile_origin: (3,) in the tile.
         set_origin: (3,) in the set, which the result is relative to.
     """

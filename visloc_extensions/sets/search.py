@@ -104,12 +104,7 @@ class SetSearch:
         )
 
     async def localize(self, job: RigJob, map_set: MapFolder) -> Localization:
-        """Localize a photo, or the images of a rig, in a set.
-
-        Raises:
-            NotFound: ``set.no_tile`` when the priors allow no tile.
-            VislocError: errors of ``search`` and of the tiles' maps.
-        """
+        """Localize a photo, or the images of a rig, in a set."""
         outline = self._catalog.set_outline(map_set)
         allowed = allowed_tiles(outline, job.priors, await self.within(outline, job.maps))
 
@@ -183,11 +178,6 @@ class SetSearch:
 
         Returns:
             The row of a tile, and its answer in the set's frame.
-
-        Raises:
-            Unavailable: ``set.tile_unavailable`` for a tile that cannot be opened, unless another
-                one has a clear answer.
-            VislocError: the error of ``ask`` when every tile raises one.
         """
         found: list[tuple[int, Localization]] = []
         missing: list[tuple[TileRecord, VislocError]] = []

@@ -66,21 +66,11 @@ def split_map(
 
     Args:
         store: holds the map; the tiles and the set are published there.
-        ref: ``id`` or ``id@version`` of the map.
         set_id: id of the set; tiles are called ``<set id>-<i>-<j>``.
-        progress: told how far each stage is.
         tile: side of a cell in units of the world.
-        overlap: width of the margin, likewise.
 
     Returns:
         The folder of the set's version.
-
-    Raises:
-        InvalidInput: ``split.tile``, ``split.overlap``; ``map.is_set`` for a set.
-        Conflict: ``map.no_landmarks``; ``map.doubtful`` for a version in doubt that is not in use;
-            ``set.id_is_map``;
-            ``split.map_exists`` when a map that is none of these tiles has the id of one; and what
-            ``publish_set`` raises.
     """
     checked_name(set_id, "set")
     opened = open_published(store.folder(ref))
@@ -122,9 +112,6 @@ def cut(opened: Map, tile: float, overlap: float) -> tuple[Cut, ...]:
         opened: the map; where it does not know down, the plane is that of its x and y.
         tile: side of a cell in units of the world.
         overlap: photos of others that are as near to a cell belong to it too.
-
-    Raises:
-        InvalidInput: ``split.tile``, ``split.overlap``.
     """
     if not (np.isfinite(tile) and tile > 0):
         raise refuse("split.tile", field="--tile", got=tile)

@@ -31,8 +31,6 @@ def hard_to_find(
     """Return tiles that must be searched because a doubtful answer may be theirs.
 
     Args:
-        outline: the set.
-        doubtful: refs of the tiles with doubtful answers.
         left: (T,) tiles that may be searched, and were not.
 
     Returns:
@@ -69,8 +67,6 @@ def left_open(
     Tiles whose photos lie among each other show the same place, and are never open.
 
     Args:
-        outline: the set.
-        row: of the tile whose answer was chosen.
         places: the answers of the tiles that were searched, by row.
         elsewhere: (T,) tiles that the priors allow and that gave no pose at the same place.
         close: rows of the tiles with at least half of the best coarse score.
@@ -114,7 +110,6 @@ def apart(boxes: NDArray[np.float64], row: int) -> NDArray[np.bool_]:
 
     Args:
         boxes: (T, 2, 3) least and largest coordinates of each tile's photos.
-        row: of the tile.
     """
     low, high = boxes[:, 0], boxes[:, 1]
     return np.asarray(((low > high[row]) | (high < low[row])).any(axis=1))

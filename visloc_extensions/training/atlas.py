@@ -78,7 +78,6 @@ def look(
         begins: (n,) int64.
         sizes: (n, 2) int64.
         level_from_crop: (n, 3, 3) float64.
-        crop_px: side of the crops.
     """
     places = applied(level_from_crop, pixel_centres(crop_px, pixels.device)) - 0.5
     corner = places.floor()

@@ -26,12 +26,9 @@ class State:
     There is no state of random numbers: those of a step come from the seed and its number.
 
     Attributes:
-        settings: of the run.
-        step: how many are done.
         seconds: how long that took, on all machines together.
         sources: words for the model card: sha256 of the photos, their licences, and so on.
         network: state dict of ``TrainableR2D2``, or of ``XFeat``.
-        optimizer: state dict of Adam.
     """
 
     settings: Settings
@@ -59,12 +56,7 @@ def save_state(path: Path, state: State) -> None:
 
 
 def load_state(path: Path, device: torch.device) -> State:
-    """Read a checkpoint; nothing in it is run.
-
-    Raises:
-        NotFound: ``training.checkpoint`` if there is no such file.
-        InvalidInput: ``training.checkpoint`` if it is no checkpoint of this version.
-    """
+    """Read a checkpoint; nothing in it is run."""
     if not path.is_file():
         raise refuse("training.checkpoint", field=str(path), kind=NotFound)
     try:

@@ -44,15 +44,10 @@ class Conditions(NamedTuple):
         snow: share of what may lie under snow.
         wet: how much wet ground darkens and mirrors.
         horizon: height from which it does, 0 to 1 from the top.
-        shadow: how dark shadows are.
-        edge: how sharp they are.
         night: 0 or 1.
         ambient: light that is left at night, besides lamps.
         lit: light in patches, as from windows.
         lamps: (n, lamps, 8): x, y in 0 to 1, brightness, reach, size of the glow, and RGB.
-        fog: optical depth of the furthest.
-        air: brightness of the fog.
-        rain: brightness of its streaks.
         fall: angle of the streaks from the vertical, radians.
         drops: (n, drops, 3): x, y in 0 to 1, radius; on the lens.
         defocus: standard deviation, px.
@@ -70,7 +65,6 @@ class Conditions(NamedTuple):
         curve: S of the tone curve.
         local_contrast: share of a local normalization, as CLAHE does.
         grey: share of grey.
-        compression: coarseness of the cosine transform.
         starts: where in the strip of noise a photo's begins.
         shift: (n, 2), of the grid of blocks, px; the first counts for all.
     """
@@ -151,8 +145,6 @@ def draw_conditions(
     """Draw what happens to photos, each on its own.
 
     Args:
-        rng: random numbers.
-        photos: how many.
         strength: 0 to 1; at 0 nothing happens.
         night_share: of the photos, at full strength.
         weather_share: of them have a weather, a season, or shadows, if they draw it.

@@ -90,9 +90,6 @@ def losses_of(said: Maps, taught: Maps, pairs: Pairs, closeness: Tensor) -> Tens
     """Compare what student and teacher say about pairs: (5,), as ``Distillation.names``.
 
     Args:
-        said: by the student, about the altered photos.
-        taught: by the teacher, about the clean ones.
-        pairs: their truth.
         closeness: (2 B, 1, 1, 1), how much each photo counts where both see the same place.
     """
     features, logits, reliability = said

@@ -26,11 +26,7 @@ _LARGEST_HALF = 65504.0
 
 
 def export(state: State, output: Path) -> int:
-    """Write a checkpoint as weights for ``visloc.features``; return the number of bytes.
-
-    Raises:
-        InvalidInput: ``training.range`` if a weight does not fit 16 bits.
-    """
+    """Write a checkpoint as weights for ``visloc.features``; return the number of bytes."""
     architecture = state.settings.architecture
     arrays, words = _distilled(state) if architecture == "xfeat" else _from_scratch(state)
     about = {

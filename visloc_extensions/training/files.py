@@ -31,8 +31,6 @@ def write_tensors(path: Path, arrays: Mapping[str, NDArray[Any]], about: Mapping
     """Write a safetensors file, and return its number of bytes; equal content gives equal bytes.
 
     Args:
-        path: file to write.
-        arrays: by name.
         about: what else to say; it becomes one JSON text in the metadata, because the library
             writes several entries in another order each time.
     """
@@ -44,12 +42,7 @@ def write_tensors(path: Path, arrays: Mapping[str, NDArray[Any]], about: Mapping
 
 
 def read_about(path: Path) -> Any:
-    """Return what ``write_tensors`` was told to say.
-
-    Raises:
-        SafetensorError: if it is no safetensors file.
-        ValueError: if it is one that ``write_tensors`` did not write.
-    """
+    """Return what ``write_tensors`` was told to say."""
     with safe_open(path, framework="numpy") as file:
         words = file.metadata() or {}
     if _ABOUT not in words:

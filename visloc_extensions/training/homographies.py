@@ -38,9 +38,7 @@ def random_looks(
     """Return photo_from_crop (n, 3, 3) of two looks at about the same part of each photo.
 
     Args:
-        rng: random numbers.
         sizes: (n, 2), height and width of the photos.
-        crop_px: side of the crops.
         strength: 0 to 1, how far the second look is from the first.
     """
     pairs, shorter = len(sizes), sizes.min(axis=1)
@@ -75,10 +73,8 @@ def looks_at(
     """Return photo_from_crop (n, 3, 3) of cameras that look at targets (n, 2) of photos.
 
     Args:
-        rng: random numbers.
         target: photo pixels in the middle of the crops.
         scale: (n,) photo pixels per crop pixel there, the mean of all directions.
-        crop_px: side of the crops.
         tilt_deg: largest angle between the optical axis and the photo's normal.
         turn_deg: largest turn about the optical axis.
     """

@@ -50,10 +50,8 @@ def reliability_loss(
     """Return 1 - (AP * R + (1 - R) * kappa), averaged: R learns where AP is above kappa.
 
     Args:
-        precision: (...) average precision of each query.
         reliability: (...) what the network says about it, 0 to 1.
         asked: (...) bool, which of them count; without any the loss is 0.
-        good_precision: kappa.
     """
     loss = 1 - (precision * reliability + (1 - reliability) * good_precision)
     return loss.masked_fill(~asked, 0).sum() / asked.sum().clamp_min(1)
@@ -71,7 +69,6 @@ def similarity_loss(
         first: (B, H, W).
         second_seen_from_first: (B, H, W), the second map at the flow.
         valid: (B, H, W) bool, where the flow leads to.
-        patch_px: side of a patch.
     """
     share = valid.to(first.dtype)
     first, second = first * share, second_seen_from_first * share
@@ -92,7 +89,6 @@ def peakiness_loss(repeatability: Tensor, patch_px: int) -> Tensor:
 
     Args:
         repeatability: (B, H, W).
-        patch_px: even.
     """
     smooth = F.avg_pool2d(repeatability[:, None], 3, stride=1, padding=1)
     side, reach = patch_px + 1, patch_px // 2

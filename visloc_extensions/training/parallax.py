@@ -55,8 +55,6 @@ class View:
         image: (3, H, W) uint8.
         inverse_depth: (H, W) of the pixel centres, per metre along the optical axis; 0 where
             nothing is seen.
-        cam_from_world: its pose.
-        camera: a PINHOLE.
     """
 
     image: Tensor
@@ -224,10 +222,7 @@ def pack_rooms(output: Path, *, rooms: int, places: int, seed: int) -> int:
     """Photograph rooms, and return the number of photos. A photo takes most of a second.
 
     Args:
-        output: file to write.
         rooms: how many, each with other pictures on the same furniture.
-        places: per room, each with three views.
-        seed: of the first room.
     """
     arrays: dict[str, NDArray[np.generic]] = {}
     with ProcessPoolExecutor(mp_context=get_context("spawn")) as workers:
@@ -273,12 +268,7 @@ def _encoded(suffix: str, image: NDArray[np.generic], options: list[int]) -> NDA
 
 
 def read_rooms(path: Path) -> tuple[Place, ...]:
-    """Read what ``pack_rooms`` wrote.
-
-    Raises:
-        NotFound: ``training.rooms`` if there is no such file.
-        InvalidInput: ``training.rooms`` if it is another kind of file.
-    """
+    """Read what ``pack_rooms`` wrote."""
     if not path.is_file():
         raise refuse("training.rooms", field=str(path), kind=NotFound)
     try:

@@ -33,7 +33,6 @@ class Photo:
     """One photo.
 
     Attributes:
-        name: folder and file.
         levels: (3, H, W) uint8 RGB each; the first as taken, each further one of half the size.
     """
 
@@ -61,12 +60,8 @@ def pack_photos(source: Path, output: Path, *, research: bool, validation: bool)
 
     Args:
         source: its folders hold ``*.jpg`` and ``SOURCES.tsv`` with columns file and licence.
-        output: file to write.
         research: also those of folders ``*_research``, whose licences forbid commercial use.
         validation: only those held back for validation; otherwise all but those.
-
-    Raises:
-        NotFound: ``training.photos`` if there are none.
     """
     arrays, licences = {}, {}
     for path in sorted(source.glob("*/*.jpg")):
@@ -89,12 +84,7 @@ def _licences(table: Path) -> dict[str, str]:
 
 
 def read_pack(path: Path) -> Pack:
-    """Read a pack and decode its photos.
-
-    Raises:
-        NotFound: ``training.pack`` if there is no such file.
-        InvalidInput: ``training.pack`` if it is no pack.
-    """
+    """Read a pack and decode its photos."""
     if not path.is_file():
         raise refuse("training.pack", field=str(path), kind=NotFound)
     data = path.read_bytes()

@@ -22,11 +22,7 @@ def draw(folder: Path, beside: Path | None = None) -> list[Path]:
     """Write ``loss.png`` and, where there were validations, ``validation.png`` into a run's folder.
 
     Args:
-        folder: of the run.
         beside: lines of JSON that ``validate --output`` wrote of other features, drawn as levels.
-
-    Raises:
-        NotFound: ``training.log`` if the folder has no run in it.
     """
     lines = _lines(folder / LOG_NAME)
     if not lines:

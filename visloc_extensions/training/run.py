@@ -52,7 +52,6 @@ class Task(Protocol):
 
     Attributes:
         network: what learns, on the device.
-        names: of the losses.
     """
 
     @property
@@ -107,11 +106,7 @@ class Trainer:
             self._learn = RecordedStep(self._learned)
 
     def restore(self, state: State) -> None:
-        """Go on where a checkpoint stands.
-
-        Raises:
-            InvalidInput: ``training.settings`` if it is of a run with other settings.
-        """
+        """Go on where a checkpoint stands."""
         different = self.settings.difference_to(state.settings)
         if different is not None:
             raise refuse(
@@ -191,18 +186,11 @@ def train(
     fall: a longer run can start from there.
 
     Args:
-        trainer: what is trained.
-        folder: of the run.
         seconds: after which to stop; None for never.
         checkpoint_every_s: seconds.
-        should_stop: asked after every step.
         validate_every: steps; needs ``validated``. The last step is validated as well.
-        validated: the score of a state.
         fit_seconds: in which the last step is to be done, from now. The settings get as many steps
             as fit, if those are fewer.
-
-    Raises:
-        LossIsNaN: ``training.diverged``.
     """
     folder.mkdir(parents=True, exist_ok=True)
     log = _Log(folder / LOG_NAME, trainer.step, trainer.task.names)

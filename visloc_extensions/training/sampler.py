@@ -68,7 +68,6 @@ def sample(
     """Let pixels of the first images look for their match in the second ones.
 
     Args:
-        first: of B images.
         second: of as many.
         flow: (B, H, W, 2).
         queries: (B, N, 2) int64 pixels (x, y) of the first images.

@@ -64,7 +64,6 @@ class Score:
         matching_accuracy: share of the mutual nearest neighbours that are right to within each
             of ``THRESHOLDS_PX``; 0 for a pair without any.
         right_matches: number of those within 3 px.
-        keypoints: number per image.
         repeatability: share of the keypoints of the first image that are seen in the second and
             have a keypoint there within 3 px.
     """
@@ -127,9 +126,7 @@ def validate(
 
     Args:
         extractor: of the second photos, and of the first ones unless they have their own.
-        pairs: of photos.
         of_first: of the first photos, as when a map has other weights than its queries.
-        max_keypoints: per photo.
     """
     rows = [_scored((of_first or extractor, extractor), pair, max_keypoints) for pair in pairs]
     means = np.mean(rows, axis=0).tolist()

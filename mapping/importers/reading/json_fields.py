@@ -37,10 +37,7 @@ class JsonValue:
     """One value of a file.
 
     Attributes:
-        value: what ``json`` made of it.
-        file: the file.
         parent: the object or array that holds it; None at the top.
-        key: its key or index there.
         asked: the fields below it that were asked for, in any object of this place.
     """
 
@@ -187,11 +184,7 @@ def read_json(path: Path) -> JsonValue:
 
 
 def parse_json(data: bytes, path: Path) -> JsonValue:
-    """Read the content of a JSON file, as ``read_json``.
-
-    Raises:
-        DatasetError: ``import.json``.
-    """
+    """Read the content of a JSON file, as ``read_json``."""
     try:
         value = json.loads(data, parse_constant=_not_finite, object_pairs_hook=_unique_keys)
     except (ValueError, RecursionError) as error:  # of the syntax, of the text's coding, of depth

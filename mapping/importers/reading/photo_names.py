@@ -35,7 +35,6 @@ def photo_names(
     Args:
         raw: each photo's name and where it stands.
         base: the folder that relative names of the format count from.
-        photos: the folder of photos.
 
     Returns:
         The names, with forward slashes, and notes.

@@ -43,7 +43,6 @@ class Matches:
     """Verified matches of one pair of photos.
 
     Attributes:
-        first: row of a photo.
         second: row of a later photo.
         rows: (k, 2) uint32 rows of the features of both.
     """

@@ -43,7 +43,6 @@ def fits_two_views(
     Args:
         calibrated: whether the intrinsics are known; else a fundamental matrix is estimated of the
             pixels, whatever their distortion.
-        max_error_px: largest distance to the epipolar line.
         among: (n,) matches that the relative pose is estimated from; all by default. The others may
             fit it all the same.
     """

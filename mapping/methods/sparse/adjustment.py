@@ -121,7 +121,6 @@ def adjusted_robustly(
 
     Args:
         camera_ids: of the cameras whose intrinsics may change.
-        progress: in steps of both adjustments.
     """
     adjusted = pycolmap.Reconstruction(model)
     options = _robust_options(poses=True, intrinsics=True)
@@ -144,10 +143,7 @@ def adjust_growing(
     What ``mapper.adjust_global_bundle`` does, which reports nothing until it ends.
 
     Args:
-        mapper: with the model.
         options: as the pipeline has them.
-        constant: cameras whose intrinsics stay.
-        progress: in steps.
     """
     model, solver = mapper.reconstruction, options.ceres.solver_options
     mapper.observation_manager.filter_observations_with_negative_depth()

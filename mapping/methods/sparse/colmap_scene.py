@@ -31,11 +31,7 @@ _TOLD_EVERY = 10_000
 def colmap_database(
     photos: Sequence[SfmPhoto], rigs: Rigs, matches: Sequence[Matches], work: Path
 ) -> Iterator[tuple[Path, ColmapScene]]:
-    """Write a temporary COLMAP database; give its path and the ids in it.
-
-    Raises:
-        InvalidInput: ``sfm.no_matches``.
-    """
+    """Write a temporary COLMAP database; give its path and the ids in it."""
     if not matches:
         raise refuse(
             "sfm.no_matches",

@@ -64,7 +64,6 @@ class ModelPhoto:
     """A photo of a model, with what was found in it.
 
     Attributes:
-        view: its camera and pose.
         keypoints: (k, 2) pixels.
         descriptors: (k, D) int8, all with one scale.
         landmarks: (m,) int64 rows of the points that it observes.
@@ -113,9 +112,7 @@ def find_places(
     """Group the photos of a model by the place that they seem to show.
 
     Args:
-        photos: of one model.
         points: (P, 3) its points.
-        progress: in photos.
     """
     model = _Model(photos, points)
     expected, shown = [], []
@@ -147,7 +144,6 @@ def share_shown(
     It should show what photos near it observe, as in ``find_places``.
 
     Args:
-        photos: of one model.
         points: (P, 3) its points.
     """
     model = _Model(photos, points)

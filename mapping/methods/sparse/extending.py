@@ -52,9 +52,7 @@ def extend(
 
     Args:
         photos: all, placed or not.
-        model: without rigs.
         late: at least one photo.
-        work: folder for temporary files.
     """
     rows = [row for row, view in enumerate(late.views) if view is not None]
     number = {row: order for order, row in enumerate(rows)}

@@ -36,7 +36,6 @@ def largest_model(
     those of the largest.
 
     Args:
-        path: of the database with photos and matches.
         options: with ``image_names``, the photos that take part.
         progress: called with how much of the current model is done, in photos: each is counted
             once when it joins, once when all photos so far were adjusted with it, and once when all

@@ -149,7 +149,6 @@ def doubt_of(
     """Judge a refined camera.
 
     Args:
-        camera: refined.
         prior_px: its focal length before; None if it was unknown.
         rise_px: root mean square rise of the reprojection errors in its photos, if its focal length
             changes by ``STEP`` and all else adapts. None for an implausible camera.
@@ -169,7 +168,6 @@ def notes_on(origins: Mapping[str, CameraOrigin], photos: Mapping[str, Sequence[
 
     Args:
         origins: of cameras, by id.
-        photos: names of the photos of each camera.
     """
     notes = []
     for known in (True, False):

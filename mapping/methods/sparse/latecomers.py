@@ -85,7 +85,6 @@ def place_latecomers(
     Args:
         describe: returns the descriptors (k, D) of a photo's keypoints, all with one scale.
         matches: verified, between all photos, believed or not.
-        model: without rigs.
         progress: called with the number of photos placed, and of all that had no place.
     """
     growing = _Growing(photos, describe, matches, model, config)

@@ -62,8 +62,6 @@ def without_look_alikes(
 
     Args:
         photos: in any order; those of one sensor are put in order of time.
-        matches: verified.
-        progress: in pairs.
     """
     confirmed = _Confirmed(photos, matches)
     order = ranks_in_time(photos)

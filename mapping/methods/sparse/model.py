@@ -56,8 +56,6 @@ class SfmPhoto:
     """The mapper's view of a photo.
 
     Attributes:
-        name: unique.
-        sensor: id of its camera.
         timestamp: photos of a rig with equal timestamps were taken together.
         camera: intrinsics, equal for all photos of the sensor.
         camera_known: whether they are more than a guess.
@@ -103,11 +101,7 @@ _NOWHERE = View(Camera("SIMPLE_PINHOLE", 1, 1, (1.0, 0.5, 0.5)), Pose.identity()
 
 
 def without_bad_points(model: SparseModel, config: MapperConfig) -> SparseModel:
-    """Drop the points that miss a threshold.
-
-    Raises:
-        InvalidInput: ``sfm.no_points`` when none is left.
-    """
+    """Drop the points that miss a threshold."""
     views = [view or _NOWHERE for view in model.views]
     observations = model.observations
     errors = reprojection_errors(views, model.points, observations)

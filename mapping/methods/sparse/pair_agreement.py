@@ -37,8 +37,6 @@ def contradicted_pairs(
 
     Args:
         model: of all photos; pairs with photos that have no place in it are passed over.
-        pairs: verified without the poses.
-        max_error_px: within which their matches were verified.
     """
     found, compared = [], 0
     for pair in pairs:

@@ -29,8 +29,6 @@ def triangulate_points(
     """Give a model of photos with poses the points of their matches.
 
     Args:
-        model: changed in place.
-        path: of the database with the matches.
         progress: called with how much is done, in photos: each is counted once when its matches
             are triangulated, once in each adjustment, and once after each of these, when tracks
             are completed and merged.

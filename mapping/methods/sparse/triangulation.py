@@ -65,18 +65,10 @@ def triangulate(
     """Triangulate points with the poses of the photos.
 
     Args:
-        photos: n photos with poses.
-        rigs: used where the poses agree with them.
-        matches: verified.
-        config: thresholds.
         refine: names of ``REFINABLE``: what bundle adjustment may change afterwards. Refined poses
             are aligned to the given ones again. Intrinsics in doubt (``SparseModel.doubts``) stay.
-        work: folder for temporary files.
         progress: of the stages ``TRIANGULATION``, as ``triangulate_points``, ``READING``, in
             points, and where something is refined ``ADJUSTMENT``, in steps of bundle adjustments.
-
-    Raises:
-        InvalidInput: ``sfm.no_matches``, ``sfm.no_points``.
     """
     adjusting = partial(progress, ADJUSTMENT)
     with colmap_database(photos, rigs, matches, work) as (path, scene):
@@ -118,9 +110,6 @@ def reconstruct(
     taken.
     The stages of ``progress`` are ``LOOK_ALIKES``, in pairs, ``MAPPING`` as ``largest_model``,
     ``ADJUSTMENT`` in steps of bundle adjustments, and those of ``triangulate``.
-
-    Raises:
-        InvalidInput: ``sfm.no_matches``, ``sfm.no_model``, ``sfm.camera``, ``sfm.no_points``.
     """
     if filtered:
         matches = without_look_alikes(photos, matches, partial(progress, LOOK_ALIKES))
@@ -226,9 +215,7 @@ def solve_with_priors(
     Args:
         solve: makes a model, given doubts. Sensors in doubt that have a prior keep it; photos of
             the others are left out.
-        refined: sensors whose intrinsics ``solve`` refines.
         progress: of judging the cameras, in steps of bundle adjustments.
-        poses: whether it refines poses too.
 
     Returns:
         The model, and all doubts. Sensors without a prior that are merely undetermined are in both.

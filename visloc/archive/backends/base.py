@@ -78,15 +78,9 @@ class Backend(Protocol):
         version is there and the one before it stays current.
 
         Args:
-            incoming: the version, within the folder that ``incoming`` gave.
             map_id: the map's id.
             version: the version's name.
-            make_current: whether to switch ``current`` to it.
             based_on: the version that ``current`` must still name when it is switched.
-
-        Raises:
-            Conflict: ``map.version_exists``, ``map.upload_runs`` or ``map.outdated`` when the lock
-                does not keep other publishers out and one of them was faster.
         """
 
     def set_current(self, map_id: str, version: str) -> None:

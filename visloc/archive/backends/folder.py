@@ -168,12 +168,7 @@ class FolderBackend:
 
 @contextmanager
 def storage_errors(place: Path) -> Iterator[None]:
-    """Turn a full or read-only disk into an error for users.
-
-    Raises:
-        StorageFull: ``maps.storage_full``.
-        Forbidden: ``maps.read_only``.
-    """
+    """Turn a full or read-only disk into an error for users."""
     try:
         yield
     except OSError as error:

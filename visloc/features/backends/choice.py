@@ -19,12 +19,7 @@ _EIGHT_BIT_FLAGS = frozenset({"avx512_vnni", "avx_vnni", "amx_int8"})
 
 
 def choose_inference(wanted: Inference) -> Inference:
-    """Return ``wanted``, or what AUTO is here: TORCH, INT8 or FP32. Loads OpenVINO for the others.
-
-    Raises:
-        InvalidInput: ``inference.unavailable`` if it needs OpenVINO, which is not installed or
-            cannot be loaded, or 8 bits, which the processor is not made for.
-    """
+    """Return ``wanted``, or what AUTO is here. All but TORCH load OpenVINO."""
     if wanted is Inference.AUTO:
         chosen, reason = _automatic()
         _log_once(chosen, reason)

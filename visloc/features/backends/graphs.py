@@ -43,11 +43,6 @@ def open_graph(
     """Return the compiled graph of a network, None if torch is to compute it.
 
     AUTO is torch on a GPU, without OpenVINO, and for weights of which no graph was made.
-
-    Raises:
-        InvalidInput: ``inference.unavailable`` if OpenVINO is asked for and there is no graph, or
-            as ``choose_inference`` says.
-        WeightsError: ``weights.altered`` or ``weights.format`` for a graph that cannot be used.
     """
     chosen = choose_inference(inference)
     if chosen is Inference.TORCH:

@@ -25,9 +25,6 @@ def import_openvino() -> ModuleType:
 
     Use this, never a plain import: the converter of models, which that would load as well, tells
     Google Analytics that it was loaded and keeps an identifier in the user's home.
-
-    Raises:
-        ImportError: it is not installed, or cannot be loaded.
     """
     with _IMPORT_LOCK:
         # OpenVINO 2026.4 crashes the process where AMX computes Fast-R2D2 in 8 bits on wide, low
@@ -50,10 +47,8 @@ class Graph:
     Threads that use one take turns. It keeps room for the largest arrays that it computed.
 
     Args:
-        model: an ``openvino.Model``, which is changed.
         in_8_bits: whether to round as the graph says; if not, all is computed in floats.
         threads: of the processor; None for all.
-        computed_with: see ``LocalFeatureExtractor``.
     """
 
     def __init__(

@@ -24,12 +24,8 @@ def load_strictly(
     """Give a network on the device ``meta`` the tensors of a checkpoint, in double precision.
 
     Args:
-        network: without values.
         checkpoint: with exactly the network's tensors.
         held: what the file seems to hold instead, for the message.
-
-    Raises:
-        WeightsError: those of ``check_shapes``.
     """
     check_shapes(checkpoint, shapes_of(network), network=network_name, held=held)
     tensors = {name: torch.tensor(array) for name, array in checkpoint.tensors.items()}

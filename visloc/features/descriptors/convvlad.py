@@ -36,10 +36,6 @@ def load_convvlad(
     """Make the descriptor from the weights in the folder, or in the installed package.
 
     INT8 is computed in floats, as for ``gem``.
-
-    Raises:
-        WeightsError: the weights are missing, damaged, or of another network.
-        InvalidInput: ``inference.unavailable``.
     """
     return ConvVlad(*make_network("convvlad", NUM_BLOCKS, weights_dir, inference, threads))
 

@@ -28,9 +28,7 @@ def sums_of_words(
     """Sum the words of a photo up by the nearest of the centres (K, 128).
 
     Args:
-        device: of torch.
         gradients: of the photo at each scale, to the right and down, each (H, W).
-        centres: of the vocabulary.
 
     Returns:
         Sums (K, 128) and counts (K,).

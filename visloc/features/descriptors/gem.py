@@ -35,10 +35,6 @@ def load_gem(
     """Make the descriptor from the weights in the folder, or in the installed package.
 
     INT8 is computed in floats: the whole network takes little time.
-
-    Raises:
-        WeightsError: the weights are missing, damaged, or of another network.
-        InvalidInput: ``inference.unavailable``.
     """
     return Gem(*make_network("gem", None, weights_dir, inference, threads))
 

@@ -38,8 +38,6 @@ def learn_words(words: NDArray[np.float32], count: int, seed: int) -> NDArray[np
 
     Args:
         words: (n, d); n may be 0.
-        count: how many centres are wanted.
-        seed: of the sample and of the first centres.
     """
     random = np.random.default_rng(seed)
     if len(words) > KMEANS_MAX_WORDS:

@@ -27,11 +27,7 @@ def is_ready_made(name: str) -> bool:
 
 
 def ready_made_type(name: str) -> str:
-    """Return TYPE of ``kapture:TYPE``.
-
-    Raises:
-        InvalidInput: ``features.unknown`` for another name.
-    """
+    """Return TYPE of ``kapture:TYPE``."""
     if not is_ready_made(name):
         raise refuse(
             "features.unknown",
@@ -48,9 +44,6 @@ def ready_made_fingerprint(features: FeatureSet) -> Fingerprint:
 
     The files do not say with which weights or settings they were made. Two extractions of one type
     are taken to be comparable.
-
-    Raises:
-        InvalidInput: ``features.metric`` when they are not compared as this system compares.
     """
     metric = (features.metric_type or "").lower()
     if metric not in _METRICS:
@@ -82,10 +75,6 @@ def to_local_features(keypoints: NDArray[np.float32], descriptors: NDArray[Any])
     Returns:
         The same rows in the same order, descriptors scaled to unit length. Scores and scales,
         which nobody told, are 1.
-
-    Raises:
-        InvalidInput: ``features.shape`` when the counts differ; ``features.descriptor`` for a row
-            that is zero or not finite. None is dropped: rows are what observations refer to.
     """
     if descriptors.ndim != 2 or keypoints.shape != (len(descriptors), 2):
         raise refuse(
@@ -105,11 +94,7 @@ def to_local_features(keypoints: NDArray[np.float32], descriptors: NDArray[Any])
 
 
 def to_global_descriptor(row: NDArray[Any]) -> NDArray[np.float32]:
-    """Scale one global descriptor (D,) of any real type to unit length.
-
-    Raises:
-        InvalidInput: ``features.shape``; ``features.descriptor`` when it is zero or not finite.
-    """
+    """Scale one global descriptor (D,) of any real type to unit length."""
     if row.ndim != 1:
         raise refuse(
             "features.shape",

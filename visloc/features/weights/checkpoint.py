@@ -56,7 +56,6 @@ class Checkpoint:
     """Tensors of a weights file.
 
     Attributes:
-        path: where it was read from.
         sha256: of the file, lower-case hexadecimal.
         tensors: arrays by their names in the state dict; not to be written to.
         beside: what the file holds beside the state dict.
@@ -89,15 +88,8 @@ def read_checkpoint(
     The state dict may be bare or under the key ``state_dict`` or ``model_state`` of a dict.
 
     Args:
-        path: the file.
         max_bytes: how large it may be.
         sha256: of the only file that will do; checked before anything is read out of it.
-
-    Raises:
-        WeightsError: ``weights.unreadable`` when the file cannot be read, ``weights.too_large``
-            when it exceeds ``max_bytes``, ``weights.altered`` when its sha256 is another,
-            ``weights.format`` when it is neither safetensors nor a PyTorch file of plain tensors,
-            is damaged, or names anything that a state dict does not need.
     """
     data = _content(path, max_bytes)
     found_sha256 = hashlib.sha256(data).hexdigest()

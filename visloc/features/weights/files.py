@@ -26,9 +26,6 @@ class PublishedWeights:
 
     Attributes:
         file_name: as published, and as looked for in the weights folder.
-        network: name to show.
-        source: where to download it.
-        licence: name and consequence.
         sha256: of the published file; None if it was never seen here.
         max_bytes: a larger file is not read.
     """
@@ -86,10 +83,6 @@ def published_path(weights_dir: Path | None, published: PublishedWeights) -> Pat
 
     A file with another sha256 will do too, because people train their own. Its sha256 goes into
     the features' fingerprint, and ``check_shapes`` tells whether it fits the network.
-
-    Raises:
-        WeightsError: ``weights.missing`` with what to download, from where, under which licence,
-            and where to put it.
     """
     path = None if weights_dir is None else weights_dir / published.file_name
     if path is None or not path.is_file():
@@ -107,11 +100,7 @@ def published_path(weights_dir: Path | None, published: PublishedWeights) -> Pat
 
 
 def read_weights(weights_dir: Path | None, published: PublishedWeights) -> Checkpoint:
-    """Read the file that ``published_path`` finds.
-
-    Raises:
-        WeightsError: those of ``published_path`` and ``read_checkpoint``.
-    """
+    """Read the file that ``published_path`` finds."""
     return read_checkpoint(published_path(weights_dir, published), published.max_bytes)
 
 
@@ -127,14 +116,7 @@ def find_weights(
     """Look for a file in the weights folder, then in an installed package that carries it.
 
     Args:
-        file_name: as published.
-        weights_dir: the weights folder.
         package: Python name of the package, which is located but never imported.
-        folder: of the file inside the package.
-        missing: message of the error.
-
-    Raises:
-        WeightsError: ``weights.missing``.
     """
     folders = [] if weights_dir is None else [weights_dir]
     found = importlib.util.find_spec(package)
@@ -157,13 +139,7 @@ def check_shapes(checkpoint: Checkpoint, expected: Shapes, *, network: str, held
     """Check that a checkpoint has exactly the tensors of a network, all of them finite.
 
     Args:
-        expected: the shape of every tensor by name.
-        network: the expected network, for the message.
         held: the network that the file seems to hold, for the message.
-
-    Raises:
-        WeightsError: ``weights.network`` for missing, surplus or misshapen tensors;
-            ``weights.values`` for numbers that are not finite and for negative variances.
     """
     found = {name: array.shape for name, array in checkpoint.tensors.items()}
     if found != dict(expected):

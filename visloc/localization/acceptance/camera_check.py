@@ -74,9 +74,6 @@ def camera_contradiction(
 
     Args:
         view: with all its matches, and the camera that was used.
-        source: of the camera.
-        rig_from_world: the best pose with it.
-        max_error_px: largest reprojection error of an inlier.
         reduced: how many pixels of the photo, as it was sent, a side of the view's pixel spans.
 
     Returns:

@@ -40,8 +40,6 @@ def with_corrected_cameras(
     A map without a test of its own does not tell how much its matches say, so there cameras stay.
 
     Args:
-        problem: the search.
-        pose: its accepted pose.
         sensors: ids in the rig of the cameras of the views.
         cameras: what earlier photos said of them; what these say is added.
     """
@@ -121,8 +119,6 @@ def with_redraws(
     Asked of poses with few inliers, or with many matches just beyond the inlier threshold.
 
     Args:
-        problem: whose pose it is.
-        pose: passed the gates.
         reach: how far the map's photos see, units of the world.
 
     Returns:

@@ -145,11 +145,9 @@ def evidence_of(
     """Compare all photos of an instant with the map around a pose.
 
     Args:
-        geometry: of the map.
         seen: the photos, at least one.
         rig_from_world: the pose, relative to the map's origin.
         covariance: (6, 6) of the pose.
-        max_error_px: inlier threshold.
 
     Returns:
         (f,) finite numbers, in the order of ``FEATURES``.

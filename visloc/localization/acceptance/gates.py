@@ -302,7 +302,6 @@ def not_better_elsewhere(elsewhere: Problem, pose: GeneralizedPose | None) -> Re
     """Refuse the best allowed pose when a pose that the priors exclude explains the images better.
 
     Args:
-        elsewhere: matches with the photos that the priors exclude.
         pose: the best pose that the priors allow; None when there is none.
     """
     if elsewhere.num_matches < elsewhere.options.registration.min_inliers:
@@ -331,8 +330,6 @@ def contradicts_priors(
     """Refuse a pose that contradicts the priors, both from the map's origin.
 
     Args:
-        constraints: the priors.
-        rig_from_world: the pose.
         covariance: (6, 6), the errors of the map included.
     """
     contradiction = constraints.contradiction(rig_from_world, covariance)

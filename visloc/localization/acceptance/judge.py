@@ -38,7 +38,6 @@ class PlaceAnswer:
 
     Attributes:
         map: ``id@version`` of the map, or of the set of maps, in whose frame the answer is.
-        answer: to the query.
         tile: of a set, ``id@version`` of the map in it; None otherwise.
     """
 
@@ -208,7 +207,6 @@ def candidate(place: PlaceAnswer, other: InstantAnswer | None = None) -> Candida
     """State the pose of one of two places, and what speaks for it.
 
     Args:
-        place: with a pose.
         other: the answer of the other place; None when their keypoints shall not be compared.
     """
     answer = place.answer

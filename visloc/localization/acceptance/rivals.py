@@ -122,7 +122,6 @@ class _Pairs:
     Args:
         problem: its views are those of the images; those without matches, as of a camera that was
             left out, have no pairs.
-        proposed: of each view.
         best: the focal length that was found with it counts.
     """
 
@@ -277,12 +276,6 @@ def stronger_place(
     Another place counts when its pose differs from the best one by more than their uncertainty.
     The difference of the scores (``score``) of all keypoints, over its standard deviation, tells
     which place is right; a keypoint that both places explain equally well tells nothing.
-
-    Args:
-        problem: the one that was solved.
-        geometry: of the map.
-        proposed: of each view of the problem.
-        best: its best pose, which passed the gates.
 
     Returns:
         The pose of the place that explains the photo better, and no refusal; or ``best`` and a

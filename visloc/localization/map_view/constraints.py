@@ -83,11 +83,7 @@ class Frame(Protocol):
 
 
 class MapGeometry:
-    """Where a map's photos were taken and how far they see; in the map's own coordinates.
-
-    Args:
-        opened: the map.
-    """
+    """Where a map's photos were taken and how far they see; in the map's own coordinates."""
 
     def __init__(self, opened: Map) -> None:
         self.opened = opened
@@ -198,12 +194,6 @@ class PosePriors:
 
     Args:
         frame: the frame.
-        priors: as they were sent, in the world.
-
-    Raises:
-        InvalidInput: ``priors.gravity`` or ``priors.height`` when neither the map nor the request
-            knows which way is down in the world; ``priors.gnss`` when the map does not know where
-            it lies on Earth.
     """
 
     def __init__(self, frame: Frame, priors: Priors) -> None:

@@ -66,7 +66,6 @@ class LocalModel:
     """The landmarks of a map that stores none. Each observation of a photo is a landmark.
 
     Args:
-        opened: the map.
         centers: (n, 3) of its photos, relative to its origin.
         rotations: (n, 3, 3) camera from world.
     """

@@ -28,7 +28,6 @@ class MapCamera:
     """A camera of a map's photos.
 
     Attributes:
-        camera: as the map has it.
         name: make and model; "" when unknown.
         exif_px: focal length by EXIF, in pixels; None without.
     """
@@ -100,9 +99,6 @@ def resolve_camera(
     A camera given for another size of the same aspect is scaled to the photo; that of a photo that
     was reduced while it was decoded is reduced with it. For a photo on its
     own, the search for the focal length starts from the guess (``visloc.localization.solving``).
-
-    Raises:
-        InvalidInput: ``camera.size_mismatch``.
     """
     width, height = photo.width, photo.height
     if given is None:

@@ -51,10 +51,8 @@ def find_features(
 
     Args:
         photo: pixels as stored.
-        most: keypoints of a mapping image.
         options: the effort and the orientation.
         found: the cache of this photo; new features are added to it.
-        framing: how the photo is resized and turned before.
 
     Returns:
         Features with keypoints in the stored pixels, where the photo's mask lets them count, and

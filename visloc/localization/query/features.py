@@ -34,12 +34,7 @@ def max_sent_keypoints(manifest: Manifest) -> int:
 def checked_local_features(
     features: QueryFeatures, camera: Camera, manifest: Manifest
 ) -> LocalFeatures:
-    """Return sent keypoints and descriptors as local features, with rows of unit length.
-
-    Raises:
-        InvalidInput: ``features.kind``, ``features.keypoints`` or ``features.descriptors``.
-        TooLarge: ``features.too_many``.
-    """
+    """Return sent keypoints and descriptors as local features, with rows of unit length."""
     _check_kind(features.kind, manifest)
     keypoints, descriptors = features.keypoints, features.descriptors
     if keypoints.ndim != 2 or keypoints.shape[1] != 2:
@@ -74,12 +69,7 @@ def checked_global_descriptors(
     """Return the sent global descriptors by name, of unit length.
 
     Args:
-        features: what was sent.
-        manifest: of the map that they are for.
         optional: names of those that need not be sent, because they can be computed.
-
-    Raises:
-        InvalidInput: ``features.global_descriptors``.
     """
     sent = features.global_descriptors
     dims = {record.fingerprint.name: record.dim for record in manifest.global_features}

@@ -8,11 +8,7 @@ from visloc.types import Fingerprint
 
 
 def check_fingerprint(built_with: FingerprintRecord, at_hand: Fingerprint, ref: str) -> None:
-    """Refuse a map that was built with other features than the installed ones.
-
-    Raises:
-        Conflict: ``map.features``.
-    """
+    """Refuse a map that was built with other features than the installed ones."""
     there, here = _flat(built_with), _flat(FingerprintRecord.of(at_hand))
     differing = [name for name in {**there, **here} if there.get(name) != here.get(name)]
     if not differing:

@@ -22,11 +22,7 @@ class NamedPhotos:
         self._map = opened
 
     def rows(self, names: Sequence[str]) -> NDArray[np.int64]:
-        """Return the photos' rows (k,) in the map.
-
-        Raises:
-            InvalidInput: ``options.photos`` for a name that the map does not have.
-        """
+        """Return the photos' rows (k,) in the map."""
         for name in names:
             if name not in self._row_of:
                 got = f"{name}, which map {self._map.ref} does not have"
@@ -34,11 +30,7 @@ class NamedPhotos:
         return np.array([self._row_of[name] for name in names], dtype=np.int64)
 
     def check_matched(self, names: Iterable[str]) -> None:
-        """Check names of photos that matches were sent with.
-
-        Raises:
-            InvalidInput: ``features.matches`` with those that the map does not have.
-        """
+        """Check names of photos that matches were sent with."""
         unknown = [name for name in names if name not in self._row_of]
         if unknown:
             shown = ", ".join(name[:_MAX_NAME] for name in unknown[:_MAX_NAMES])

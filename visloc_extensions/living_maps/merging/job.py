@@ -33,8 +33,6 @@ class Merged:
 
     Attributes:
         a: the map whose frame it has.
-        b: the other one.
-        registration: how B lies in A.
         notes: what was left out, one sentence each.
     """
 
@@ -58,21 +56,11 @@ def merge_maps(
     """Publish one map of two that overlap, in the frame of the first; both stay.
 
     Args:
-        store: holds both.
-        a_ref: ``id`` or ``id@version``.
-        b_ref: likewise.
         map_id: of the new map; there must be none of this name.
         progress: told the stage, how much is done, and how much there is.
         min_overlap: least part of the photos of B that must be tied to A.
         accept: put it into use even if its own test speaks against it, or spoke against one of
             the two.
-
-    Raises:
-        Conflict: ``map.doubtful`` for a version in doubt that is not in use; ``merge.overlap``,
-            ``merge.unit``, ``merge.features``, ``merge.landmarks``, ``merge.photos``;
-            ``map.exists``;
-            ``build.running``.
-        InvalidInput: ``map.id``, ``merge.same``, ``merge.min_overlap``.
     """
     _refuse_name(store, map_id)
     a, b = _opened(store, a_ref, b_ref, min_overlap)
@@ -120,12 +108,7 @@ def join_as_set(
 
 
 def _refuse_name(store: MapStore, new_id: str) -> None:
-    """Refuse what is no name, or that of a map or a set that there is.
-
-    Raises:
-        InvalidInput: ``map.id``.
-        Conflict: ``map.exists``.
-    """
+    """Refuse what is no name, or that of a map or a set that there is."""
     if not ID_PATTERN.fullmatch(new_id):
         raise refuse(
             "map.id",

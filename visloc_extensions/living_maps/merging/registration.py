@@ -46,13 +46,8 @@ def register(a: Map, b: Map, min_overlap: float, progress: Progress) -> Registra
 
     Args:
         a: the map whose frame stays.
-        b: the other one.
         min_overlap: least part of the photos of B that must be tied to A.
         progress: told the stage, how much is done, and how much there is.
-
-    Raises:
-        Conflict: ``merge.overlap`` when too few photos are, or they disagree; ``merge.unit`` when
-            they agree, and units of the maps, or depth, do not.
     """
     progress("describing", 0, 1)
     described = describe_together((a, b))

@@ -39,7 +39,6 @@ class Accuracy:
     """How well queries were localized.
 
     Attributes:
-        queries: how many were asked.
         errors: of those that were localized, units of the world and degrees.
     """
 
@@ -75,13 +74,7 @@ def of_queries(
     make_descriptor: Callable[[str], GlobalDescriptor],
     progress: Progress,
 ) -> list[Accuracy]:
-    """Localize the posed photos of a dataset in each of some maps with the same local features.
-
-    Raises:
-        InvalidInput: ``prune.queries`` when the dataset has no photo with a pose.
-        Conflict: ``map.features``.
-        DatasetError: with the file that is wrong.
-    """
+    """Localize the posed photos of a dataset in each of some maps with the same local features."""
     dataset = read_dataset(queries)
     records = [record for record in dataset.images if dataset.pose(record) is not None]
     if not records:

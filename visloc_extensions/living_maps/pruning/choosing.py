@@ -59,7 +59,6 @@ def choose(opened: Map, fits: Callable[[Kept], bool], *, whole_landmarks: bool) 
     """Keep as much as fits.
 
     Args:
-        opened: the map.
         fits: whether so much may stay; what is part of something that fits does too.
         whole_landmarks: whether a landmark that stays keeps all its observations by photos that
             stay: where only their number counts.

@@ -31,8 +31,6 @@ class Pruned:
 
     Attributes:
         before: the version that it was made of.
-        after: the new version.
-        accuracy: before and after.
     """
 
     before: Map
@@ -53,17 +51,11 @@ def prune_map(
     """Publish a version of a map that is as large as it may be; the one before stays.
 
     Args:
-        map_ref: ``id``, or ``id@version`` of the current version.
         max_bytes: most that its files take, manifest aside; or None.
         max_landmarks: most landmarks; or None.
         measure: compares the accuracy of both versions; None: by photos of the map.
         accept: put it into use even if its own test speaks against it.
         progress: told the stage, how much is done, and how much there is.
-
-    Raises:
-        InvalidInput: ``prune.too_small`` with the least that is possible.
-        Conflict: ``map.no_landmarks``; ``prune.small_already``; ``map.outdated``;
-            ``build.running``.
     """
     before = store.open(map_ref)
     refuse_without_landmarks(before)

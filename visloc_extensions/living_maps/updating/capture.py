@@ -36,7 +36,6 @@ class Capture:
 
     Attributes:
         photos: n photos with known cameras.
-        names: n names in the map.
         described: their global descriptors (n, D) by name, by the map's models.
     """
 
@@ -61,12 +60,7 @@ def collect_capture(
     *,
     with_depth: bool,
 ) -> tuple[Capture, list[str]]:
-    """Collect the usable photos, not described yet, and notes on the others.
-
-    Raises:
-        Conflict: ``update.photos`` when the map has photos of these names.
-        DatasetError: ``dataset.no_photos``, and what ``collect_photos`` raises.
-    """
+    """Collect the usable photos, not described yet, and notes on the others."""
     features = context.features
     ready_made = isinstance(features, ReadyMadeFeatures)
     shown = keeps_photos(opened) or opened.colors is not None
@@ -108,12 +102,7 @@ def keeps_photos(opened: Map) -> bool:
 def open_map_features(
     settings: UpdateSettings, opened: Map, work: WorkFolder, networks: Networks
 ) -> LocalFeaturesSource:
-    """Open the dataset's local features of the map's kind; check the global ones as well.
-
-    Raises:
-        Conflict: ``map.features`` when they are not the same features as the map's.
-        WeightsError, InvalidInput, DatasetError: what opening them raises.
-    """
+    """Open the dataset's local features of the map's kind; check the global ones as well."""
     local = opened.manifest.local_features
     features = local_features_source(
         work,
@@ -140,11 +129,7 @@ def describe_capture(
     dataset: Dataset,
     capture: Capture,
 ) -> Capture:
-    """Find the local features of the photos, and describe them by the map's models.
-
-    Raises:
-        DatasetError: with the file that is wrong.
-    """
+    """Find the local features of the photos, and describe them by the map's models."""
     context.run("local features", context.features.prepare, capture.photos)
     described = {}
     for record in opened.manifest.global_features:

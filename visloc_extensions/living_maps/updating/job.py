@@ -83,8 +83,6 @@ class UpdateRecord:
 
     Attributes:
         capture: its name, or the name of its folder.
-        photos: added photos.
-        landmarks: added landmarks.
         observations: added observations, of old and new landmarks.
         scale: units of the map per unit of the dataset.
     """
@@ -110,7 +108,6 @@ class Updated:
     """The result of an update.
 
     Attributes:
-        record: as in its manifest.
         notes: on photos that were left out, one sentence each.
     """
 
@@ -126,14 +123,6 @@ def update_map(settings: UpdateSettings, progress: Progress) -> Updated:
 
     If it is killed, the same call finds its finished work again. The version that was current
     before stays current until the new one is complete and verified.
-
-    Raises:
-        Conflict: ``update.elsewhere`` for a capture that does not fit the map; ``update.photos``
-            when the map has photos of these names; ``map.outdated`` when another version is
-            current; ``map.no_landmarks`` for landmarks in a map without any; ``map.features``;
-            ``update.settings``; ``build.running``.
-        DatasetError, WeightsError, InvalidInput: with the file or the setting that is wrong.
-        Unavailable: ``storage.failed`` when the disk is full or broken.
     """
     check_settings(settings)
     store = MapStore(settings.maps_dir)

@@ -28,7 +28,6 @@ def part_of_map(
     """Return the capture's photos that have a pose as content of the map's kind, in its frame.
 
     Args:
-        content: the map.
         dataset: of the capture, with rigs in the map's unit.
         made: from the capture, in the map's frame.
     """
@@ -63,7 +62,6 @@ def landmarks_in_same_voxel(
     """Find for each new landmark (P,) the nearest old one in its voxel; -1 without one.
 
     Args:
-        old: landmarks of the map.
         new: at most one in each voxel.
         origin: (3,) a corner of a voxel.
         voxel_size: edge of a voxel in the unit of the world.

@@ -61,7 +61,6 @@ def localize_photos(
 
     Args:
         context: with local features of the map's kind.
-        photos: n photos.
         described: global descriptors (n, D) by name, by the map's models.
     """
     task = _LocalizeTask(

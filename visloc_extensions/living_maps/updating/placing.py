@@ -79,11 +79,7 @@ def evenly(items: Sequence[T], count: int) -> list[T]:
 
 
 def refuse_elsewhere(opened: Map, placed: Sequence[Placed]) -> None:
-    """Refuse a capture of which most photos are not localized.
-
-    Raises:
-        Conflict: ``update.elsewhere``.
-    """
+    """Refuse a capture of which most photos are not localized."""
     localized = sum(one.localized for one in placed)
     if localized < _MIN_PART * len(placed):
         reasons = ", ".join(f"{count} {reason}" for reason, count in _reasons(placed).items())
@@ -107,7 +103,6 @@ def place_capture(
     """Find where a capture lies, from the poses at which its photos were localized.
 
     Args:
-        opened: the map.
         photos: the photos that were tried; with poses of their own, except for ``localize``.
         placed: the map's answers to them.
         poses: a name of ``visloc_extensions.living_maps.updating.settings.POSES``.
@@ -115,10 +110,6 @@ def place_capture(
             a tie. None without depth.
         readings: returns the photos' own poses as other conventions have them, to name a mistake.
         metric: whether a unit of the photos' own poses is a metre.
-
-    Raises:
-        Conflict: ``update.elsewhere`` when too few are localized, or do not agree, or their depth
-            contradicts the map.
     """
     refuse_elsewhere(opened, placed)
     both = [(photo, one) for photo, one in zip(photos, placed, strict=True) if one.localized]
@@ -199,7 +190,6 @@ def beside(wrong: Collection[int], localized: Collection[int], count: int) -> li
     """Return the rows of photos that are not localized, and have a wrong localized neighbour.
 
     Args:
-        wrong: rows of photos that the map contradicts.
         localized: rows of all localized photos, including the wrong ones.
         count: of all photos, in the order in which they were taken.
     """

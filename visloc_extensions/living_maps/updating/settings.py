@@ -81,12 +81,7 @@ class UpdateSettings:
 
 
 def check_settings(settings: UpdateSettings) -> None:
-    """Refuse settings that would fail after long work.
-
-    Raises:
-        InvalidInput: ``update.poses``, ``update.method``, ``update.capture``,
-            ``update.depth_scale``.
-    """
+    """Refuse settings that would fail after long work."""
     for option, value, known in (
         ("poses", settings.poses, POSES),
         ("method", settings.method, METHODS),
@@ -100,12 +95,7 @@ def check_settings(settings: UpdateSettings) -> None:
 
 
 def method_for(settings: UpdateSettings, opened: Map) -> str:
-    """Return the chosen method, or else the map's; a map without landmarks gets none.
-
-    Raises:
-        Conflict: ``map.no_landmarks`` for landmarks that are to join a map without any.
-        InvalidInput: ``update.unit`` when depth has no unit in the map.
-    """
+    """Return the chosen method, or else the map's; a map without landmarks gets none."""
     if not opened.has_landmarks:
         if settings.method is not None:
             raise refuse("map.no_landmarks", field="--method", ref=opened.ref)
@@ -118,11 +108,7 @@ def method_for(settings: UpdateSettings, opened: Map) -> str:
 
 
 def refuse_strange_settings(opened: Map) -> None:
-    """Refuse a map whose recorded settings, which any software may have written, are unusable.
-
-    Raises:
-        Conflict: ``update.settings``.
-    """
+    """Refuse a map whose recorded settings, which any software may have written, are unusable."""
     settings = opened.manifest.method.settings
     voxel_size = settings.get("voxel_size", 1.0)  # only maps by depth have one
     is_length = (
@@ -146,10 +132,6 @@ def refuse_strange_settings(opened: Map) -> None:
 
 
 def refuse_few(count: int) -> None:
-    """Refuse fewer than two photos, which cannot be matched with each other.
-
-    Raises:
-        InvalidInput: ``update.photos_few``.
-    """
+    """Refuse fewer than two photos, which cannot be matched with each other."""
     if count < 2:
         raise refuse("update.photos_few", field="--method", got=f"{count} to be matched")

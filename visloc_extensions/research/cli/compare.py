@@ -156,11 +156,7 @@ def _make_folder(output: Path) -> None:
 
 
 def _drawing() -> Callable[[Mapping[str, Any]], bytes]:
-    """Find out before a long run whether there is something to draw with.
-
-    Raises:
-        InvalidInput: ``compare.matplotlib``.
-    """
+    """Find out before a long run whether there is something to draw with."""
     if importlib.util.find_spec("matplotlib") is None:
         raise refuse("compare.matplotlib")
     from visloc_extensions.research.cli.compare_plot import draw_comparison

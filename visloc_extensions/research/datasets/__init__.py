@@ -36,18 +36,8 @@ WITHOUT_READER: Mapping[str, str] = {
 def write_parts(name: str, folder: Path, output: Path) -> Mapping[str, Dataset]:
     """Write a folder for each part of a data set; photos are links to the archive.
 
-    Args:
-        name: a key of ``READERS``.
-        folder: the unpacked archive.
-        output: a folder to make.
-
     Returns:
         The parts; their notes tell what was left out.
-
-    Raises:
-        InvalidInput: ``archive.unknown``.
-        DatasetError: ``archive.missing``, ``archive.content``.
-        Conflict: ``import.exists``.
     """
     reader = READERS.get(name)
     if reader is None:

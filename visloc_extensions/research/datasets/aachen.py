@@ -30,12 +30,7 @@ _PHOTOS = ("images_upright", "images/images_upright")
 
 
 def read_aachen(folder: Path) -> Mapping[str, Dataset]:
-    """Read database and query photos of the first version.
-
-    Raises:
-        DatasetError: ``archive.missing``, ``archive.content``, with the file; ``camera.*``;
-            ``import.*`` for a damaged NVM file.
-    """
+    """Read database and query photos of the first version."""
     model = folder / _MODELS / "aachen_cvpr2018_db.nvm"
     if not model.is_file():
         raise refuse("archive.missing", field=str(model), expected="the model of VisualSFM")

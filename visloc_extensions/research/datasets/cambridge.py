@@ -29,11 +29,7 @@ _FARTHEST = 10_000.0
 
 
 def read_cambridge(folder: Path) -> Mapping[str, Dataset]:
-    """Read the mapping and the query photos of a scene, each with a camera of its own.
-
-    Raises:
-        DatasetError: ``archive.missing``, ``archive.content``, with the file; ``camera.*``.
-    """
+    """Read the mapping and the query photos of a scene, each with a camera of its own."""
     focal_lengths = _focal_lengths(folder / _NVM)
     return {part: _read(folder, name, focal_lengths) for part, name in _SPLITS.items()}
 

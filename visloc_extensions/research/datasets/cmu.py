@@ -25,11 +25,7 @@ _NAME = re.compile(r"img_\d+_(c\d+)_(\d{1,18})us(?:_rect)?\.jpg")
 
 
 def read_cmu(folder: Path) -> Mapping[str, Dataset]:
-    """Read database and query photos of a slice.
-
-    Raises:
-        DatasetError: ``archive.missing``, ``archive.content``, with the file; ``camera.*``.
-    """
+    """Read database and query photos of a slice."""
     cameras = read_cameras(folder.resolve().parent / "intrinsics.txt")
     slice_name = folder.resolve().name
     database = folder / f"ground-truth-database-images-{slice_name}.txt"

@@ -16,11 +16,7 @@ from visloc_extensions.research.datasets.text import read_lines
 
 
 def read_cameras(path: Path) -> dict[str, Camera]:
-    """Read lines ``name MODEL width height params...``; ``name`` is a photo's or a camera's.
-
-    Raises:
-        DatasetError: ``archive.missing``, ``archive.content``; ``camera.*``, with the line.
-    """
+    """Read lines ``name MODEL width height params...``; ``name`` is a photo's or a camera's."""
     expected = "name MODEL width height params..."
     found: dict[str, Camera] = {}
     for line in _without_comments(read_lines(path, expected)):
@@ -37,9 +33,6 @@ def read_centers(path: Path) -> dict[str, Pose]:
     """Read ``cam_from_world`` by photo from lines ``name qw qx qy qz cx cy cz``.
 
     The quaternion is that of ``cam_from_world``, and c is the camera's centre in the world.
-
-    Raises:
-        DatasetError: ``archive.missing``, ``archive.content``.
     """
     expected = "name.jpg qw qx qy qz cx cy cz"
     found: dict[str, Pose] = {}
@@ -64,12 +57,7 @@ def with_own_cameras(
     """Make a dataset in which each photo has a camera of its own.
 
     Args:
-        root: the folder of the photos.
-        cameras: by photo.
         poses: ``cam_from_world`` by photo; of some, or of none.
-
-    Raises:
-        DatasetError: ``archive.missing`` for a photo that is not there.
     """
     check_photos(root, cameras)
     return Dataset(

@@ -26,12 +26,7 @@ _REFERENCE = "overcast-reference"
 
 
 def read_robotcar(folder: Path) -> Mapping[str, Dataset]:
-    """Read the photos of the reference condition, and those of all others.
-
-    Raises:
-        DatasetError: ``archive.missing``, ``archive.content``, with the file; ``camera.*``;
-            ``import.*`` for a damaged NVM file.
-    """
+    """Read the photos of the reference condition, and those of all others."""
     sensors = {name: Sensor.with_camera(name, _camera(folder, name)) for name in _CAMERAS}
     model, root = folder / "3D-models" / "all-merged" / "all.nvm", folder / "images"
     if not model.is_file():

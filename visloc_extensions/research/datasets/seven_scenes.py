@@ -46,11 +46,7 @@ _MAX_ROTATION_ERROR = 1e-3
 
 
 def read_seven_scenes(folder: Path) -> Mapping[str, Dataset]:
-    """Read the mapping and the query sequences of a scene, such as ``7scenes/chess``.
-
-    Raises:
-        DatasetError: ``archive.missing``, ``archive.content``, with the file.
-    """
+    """Read the mapping and the query sequences of a scene, such as ``7scenes/chess``."""
     return {
         part: _read(folder, [_sequence_of(path, line) for line in read_lines(path, _ONE_SCENE)])
         for part, path in ((part, folder / name) for part, name in _SPLITS.items())

@@ -8,15 +8,7 @@ from visloc.errors import refuse
 
 
 def read_lines(path: Path, expected: str) -> list[str]:
-    """Return the lines of a file without those that are blank, stripped.
-
-    Args:
-        path: of the archive.
-        expected: what the file is, for errors.
-
-    Raises:
-        DatasetError: ``archive.missing``; ``archive.content`` when it is no text, or empty.
-    """
+    """Return the lines of a file without those that are blank, stripped."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:

@@ -63,7 +63,6 @@ class Asked:
     """The results with one value.
 
     Attributes:
-        variant: the value.
         refusal: why the server does not take it at all.
         outcomes: of all requests, in their order.
     """
@@ -88,11 +87,7 @@ class Asked:
 
 
 def parse_values(text: str | None) -> tuple[str, ...]:
-    """Parse words with commas between, each once; none for None.
-
-    Raises:
-        InvalidInput: ``compare.values``.
-    """
+    """Parse words with commas between, each once; none for None."""
     if text is None:
         return ()
     values = tuple(value.strip() for value in text.split(","))
@@ -111,10 +106,6 @@ def make_variants(
         values: of the axis; its usual ones when empty.
         maps: one for each of the local features, else one.
         fixed: the options that do not vary.
-
-    Raises:
-        InvalidInput: ``compare.maps``, ``compare.values``, ``compare.option``, or ``options.*``
-            for a value that cannot be sent.
     """
     if axis is Axis.LOCAL_FEATURES:
         return _variants_of_maps(values, maps, fixed)
@@ -172,13 +163,7 @@ async def ask_each(
     the server refuses is marked and not tried again.
 
     Args:
-        variants: the values.
-        queries: the photos.
         repeats: how often each photo is sent with each value.
-        advance: called once for each photo, repetition and value.
-
-    Raises:
-        VislocError: when the server is gone, or refuses all values.
     """
     asked = [Asked(variant) for variant in variants]
     for each in asked:
@@ -211,10 +196,6 @@ def make_comparison(
 
     Args:
         axis: the axis.
-        asked: the results with each value.
-        queries: the photos.
-        server: that answered.
-        told: further entries: how the comparison was called.
     """
     return {
         "axis": axis.value,

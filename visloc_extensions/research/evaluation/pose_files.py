@@ -22,7 +22,6 @@ class KnownPose:
     """A pose of a file.
 
     Attributes:
-        pose: ``cam_from_world``.
         covariance: (6, 6) of rotation (rad) then translation; None where the file has none.
     """
 
@@ -37,10 +36,6 @@ def read_poses(path: Path) -> dict[str, KnownPose]:
         path: a text file with lines ``name qw qx qy qz tx ty tz`` of ``cam_from_world``, as
             ``localize batch``, hloc and kapture write them and visuallocalization.net takes them;
             a kapture folder; ``results.jsonl``, or the folder that ``localize batch`` wrote.
-
-    Raises:
-        DatasetError: ``poses.missing``, ``poses.unreadable``, ``poses.line``, ``poses.duplicate``,
-            ``results.line``, ``kapture.*``.
     """
     if (path / _RESULTS).is_file():
         path = path / _RESULTS

@@ -70,12 +70,7 @@ class Conditions:
 
 
 def read_scene(poses: Path, truth: Path) -> Scene:
-    """Compare the poses of a file with true ones.
-
-    Raises:
-        DatasetError: ``evaluation.no_truth``; ``evaluation.names`` when no pose is of a photo with
-            a true pose; and as ``read_poses`` and ``of_photos``.
-    """
+    """Compare the poses of a file with true ones."""
     true_poses = read_poses(truth)
     if not true_poses:
         raise refuse("evaluation.no_truth", field=str(truth))
@@ -97,10 +92,6 @@ def read_conditions(patterns: Sequence[str], listed: Path | None) -> Conditions:
 
     The fields of a line are separated by a comma or by blanks. Lines that begin with ``#`` are
     skipped; ``./#1.jpg`` is the photo ``#1.jpg``.
-
-    Raises:
-        InvalidInput: ``conditions.syntax``.
-        DatasetError: ``conditions.line``, ``conditions.unreadable``.
     """
     pairs = []
     for text in patterns:
@@ -119,9 +110,6 @@ def score(
 
     ``average`` is the plain mean over the finest rows: the conditions of all scenes where
     conditions are given, else the scenes. A median is averaged when every row has it.
-
-    Raises:
-        InvalidInput: ``conditions.empty`` for a condition without a photo.
     """
     rows, finest = [], []
     seen: set[str] = set()

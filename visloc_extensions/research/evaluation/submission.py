@@ -69,14 +69,7 @@ def make_submission(
     """Name and complete the poses of a batch.
 
     Args:
-        results: ``results.jsonl``, or the folder that has it.
-        benchmark: whose names are wanted.
         mapping: poses of the mapping photos by name. Without them no photo is filled.
-
-    Raises:
-        DatasetError: ``submission.results``; ``submission.names`` when two photos would have one
-            name; ``submission.camera``; ``submission.mapping`` when a retrieved photo has no pose;
-            ``results.line``.
     """
     path = results / "results.jsonl" if results.is_dir() else results
     newest = {result.name: result for result in read_results(path)}

@@ -44,15 +44,9 @@ def make_network(
     """Make the way of computing a descriptor's network, and return the weights' sha256 too.
 
     Args:
-        feature: name of the descriptor.
         num_blocks: see ``EfficientNetLite0.forward``.
-        weights_dir: folder of weights.
         inference: INT8 is computed in floats.
         threads: of the processor, None for all.
-
-    Raises:
-        WeightsError: the weights are missing, damaged, or of another network.
-        InvalidInput: ``inference.unavailable``.
     """
     path = weights_path(weights_dir)
     sha256 = sha256_of(path)
@@ -66,11 +60,7 @@ def make_network(
 
 
 def weights_path(weights_dir: Path | None) -> Path:
-    """Return the file of weights, in the folder or else in the installed package.
-
-    Raises:
-        WeightsError: ``weights.missing``.
-    """
+    """Return the file of weights, in the folder or else in the installed package."""
     return find_weights(
         _FILE,
         weights_dir,

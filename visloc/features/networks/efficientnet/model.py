@@ -135,7 +135,6 @@ class TorchNetwork:
     """Computes the network with torch, on a CUDA GPU where there is one.
 
     Args:
-        network: for inference.
         num_blocks: see ``EfficientNetLite0.forward``.
     """
 
@@ -153,11 +152,7 @@ class TorchNetwork:
 
 
 def read_network(path: Path) -> tuple[EfficientNetLite0, str]:
-    """Return the network for inference, and its file's sha256.
-
-    Raises:
-        WeightsError: the file is damaged, or of another network.
-    """
+    """Return the network for inference, and its file's sha256."""
     checkpoint = read_checkpoint(path)
     with torch.device("meta"):
         network = EfficientNetLite0()

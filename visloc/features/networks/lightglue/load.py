@@ -29,11 +29,9 @@ class PackagedWeights:
     """A weights file that an installable package carries.
 
     Attributes:
-        file_name: as published.
         prefix: of the network's tensors in the state dict; others belong to something else.
         package: name of the package to import.
         folder: of the file inside the package.
-        install: how to install it.
     """
 
     file_name: str
@@ -67,17 +65,7 @@ LIGHTGLUE: Mapping[str, tuple[Design, PackagedWeights]] = {
 
 @cache  # maps share it
 def make_lightglue(local_features: str, weights_dir: Path | None = None) -> LightGlue:
-    """Build the network that matches these local features.
-
-    Args:
-        local_features: their name.
-        weights_dir: folder with network weights, looked into first.
-
-    Raises:
-        InvalidInput: ``options.matcher`` when there is none for them.
-        WeightsError: ``weights.missing``, with what to install, and those of ``read_checkpoint``
-            and ``check_shapes``.
-    """
+    """Build the network that matches these local features."""
     if local_features not in LIGHTGLUE:
         raise refuse(
             "options.matcher",
@@ -102,11 +90,7 @@ def make_lightglue(local_features: str, weights_dir: Path | None = None) -> Ligh
 
 
 def read_tensors(path: Path, prefix: str, design: Design) -> Checkpoint:
-    """Read the tensors of a network of this design, without the prefix of their names.
-
-    Raises:
-        WeightsError: those of ``read_checkpoint`` and ``check_shapes``.
-    """
+    """Read the tensors of a network of this design, without the prefix of their names."""
     checkpoint = read_checkpoint(path)
     tensors = {
         name.removeprefix(prefix): array

@@ -15,7 +15,6 @@ class Design:
     Attributes:
         descriptor_dim: D, length of the local features' descriptors.
         width: numbers of a keypoint's state, in all heads together.
-        num_layers: of self- and cross-attention.
         min_matchability: keypoints less likely to have a match are left out of later layers.
         stop_share: share of keypoints sure of their match at which later layers are left out;
             those not sure are kept in then. None: nobody is asked.

@@ -40,7 +40,6 @@ class Architecture:
     """A network without its weights.
 
     Attributes:
-        published: its published weights.
         pool_after: how many layers come before the pooling; 0 for no pooling.
     """
 

@@ -45,9 +45,6 @@ def weights_path(architecture: Architecture, weights_dir: Path | None) -> Path:
     """Return the file of weights: the published one in the folder, else our own.
 
     Our own shipped weights are not for a folder that does not exist: its name was meant for others.
-
-    Raises:
-        WeightsError: ``weights.missing``.
     """
     published = architecture.published
     if weights_dir is None or not (weights_dir / published.file_name).is_file():

