@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import io
 import pickle
+import struct
 import threading
 import warnings
 from collections.abc import Callable, Mapping
@@ -38,6 +39,7 @@ _SAFE_NAMES_LOCK = threading.Lock()
 _MALFORMED = (
     SafetensorError,
     pickle.UnpicklingError,
+    struct.error,
     ArithmeticError,
     AssertionError,
     AttributeError,

@@ -225,6 +225,7 @@ def test_photos_below_256_px_are_looked_at_once_at_their_own_size(long_side: int
     assert list(pyramid_sizes(1, long_side)) == [(1.0, (1, long_side), True)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "published"),
     [

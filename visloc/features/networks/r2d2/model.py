@@ -190,8 +190,8 @@ def pack(network: R2D2Network) -> dict[str, NDArray[Any]]:
     arrays = {name: tensor.cpu().numpy() for name, tensor in network.state_dict().items()}
     arrays["heads.weight"] = arrays["heads.weight"][:, :, 0, 0]
     return {
-        f"{network.architecture.name}.{name}": (
-            array.astype(np.float16) if name.endswith(".weight") else array
+        f"{network.architecture.name}.{name}": np.ascontiguousarray(
+            array, np.float16 if name.endswith(".weight") else np.float32
         )
         for name, array in arrays.items()
     }

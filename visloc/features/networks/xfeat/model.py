@@ -160,6 +160,8 @@ def pack(network: XFeat) -> Mapping[str, NDArray[Any]]:
     """Return the tensors of a file of our own: weights in 16 bits, biases in 32."""
     arrays = {name: tensor.cpu().numpy() for name, tensor in network.state_dict().items()}
     return {
-        _OWN_PREFIX + name: array.astype(np.float16) if name.endswith(".weight") else array
+        _OWN_PREFIX + name: np.ascontiguousarray(
+            array, np.float16 if name.endswith(".weight") else np.float32
+        )
         for name, array in arrays.items()
     }
