@@ -13,6 +13,7 @@ import torch.nn.functional as F
 
 from samples.papers import art_poster
 from visloc.errors import InvalidInput
+from visloc.features.networks.r2d2.architecture import ARCHITECTURES
 from visloc.features.networks.r2d2.extractor import R2D2Extractor
 from visloc.features.networks.r2d2.load import load_faster2d2
 from visloc.options import Inference
@@ -20,7 +21,7 @@ from visloc.photos.reading import read_photo_file
 from visloc_extensions.training.__main__ import main
 from visloc_extensions.training.checkpoint import FILE_NAME, load_state
 from visloc_extensions.training.export import export
-from visloc_extensions.training.network import ARCHITECTURES, TrainableR2D2
+from visloc_extensions.training.network import TrainableR2D2
 from visloc_extensions.training.pairs import make_sources
 from visloc_extensions.training.photos import Photo, photo_levels
 from visloc_extensions.training.run import LOG_NAME, Trainer, learning_rate, resume, train
