@@ -117,17 +117,18 @@ def test_a_sequence_changes_tiles_only_where_its_odometry_has_it(
     study = SITE_FROM_STUDY.move(in_study[0][2])
     still = Pose.identity()
     for moved, expected in (
-        (still, ["room", "room", "room"]),
-        (study @ room.inverse(), ["room", "study", "room"]),
+        (still, ["room"] * 4),
+        (study @ room.inverse(), ["room", "room", "study", "room"]),
     ):
-        poses = [still, moved, still]
+        # Three that agree overrule one.
+        poses = [still, still, moved, still]
         sent = [
             Instant(
                 START + 100 * i,
                 (RigImage("camera", photo, queries[0].camera),),
                 odometry=Odometry(pose),
             )
-            for i, (photo, pose) in enumerate(zip([here, there, here], poses, strict=True))
+            for i, (photo, pose) in enumerate(zip([here, here, there, here], poses, strict=True))
         ]
         assert [tile for _, tile in told(client, sent, "site")] == expected
 
