@@ -47,9 +47,7 @@ LOCAL_FEATURES: Mapping[str, tuple[str, str]] = {
     "xfeat": ("visloc.features.networks.xfeat.load", "load_xfeat"),
 }
 GLOBAL_FEATURES: Mapping[str, tuple[str, str]] = {
-    "convvlad": ("visloc.features.descriptors.convvlad", "load_convvlad"),
     "densevlad": ("visloc.features.descriptors.densevlad", "load_densevlad"),
-    "gem": ("visloc.features.descriptors.gem", "load_gem"),
     "localvlad": ("visloc.features.descriptors.vlad", "load_localvlad"),
 }
 # XFeat is free for any use and fast; R2D2's published weights are for research only.

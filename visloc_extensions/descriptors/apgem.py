@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from visloc.errors import refuse
 from visloc.features.base import GlobalDescriptor
-from visloc.features.descriptors.pooling import generalized_mean
 from visloc.features.descriptors.whitening import unit_rows
 from visloc.features.weights.checkpoint import Checkpoint
 from visloc.features.weights.files import PublishedWeights, check_shapes, read_weights
@@ -35,6 +34,7 @@ from visloc_extensions.descriptors.network_descriptor import (
     shrunk_size,
     without_training,
 )
+from visloc_extensions.descriptors.pooling import generalized_mean
 from visloc_extensions.descriptors.principal_components import (
     STAND_INS,
     PrincipalComponents,

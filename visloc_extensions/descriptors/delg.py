@@ -23,7 +23,6 @@ import torch
 from numpy.typing import NDArray
 
 from visloc.features.base import GlobalDescriptor
-from visloc.features.descriptors.pooling import generalized_mean
 from visloc.features.descriptors.whitening import unit_rows
 from visloc.features.weights.checkpoint import Checkpoint
 from visloc.features.weights.files import PublishedWeights, check_shapes, read_weights
@@ -37,6 +36,7 @@ from visloc_extensions.descriptors.network_descriptor import (
     shrunk_size,
     without_training,
 )
+from visloc_extensions.descriptors.pooling import generalized_mean
 from visloc_extensions.descriptors.resnet import FEATURES, Layout, ResNet, depth_of, expected_shapes
 
 SCALES = (1 / sqrt(2), 1.0, sqrt(2))

@@ -12,9 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from visloc.features.descriptors.convvlad import NUM_BLOCKS
-from visloc.features.networks.efficientnet import load as efficientnet
-from visloc.features.networks.efficientnet.model import read_network as read_efficientnet
 from visloc.features.networks.r2d2 import load as r2d2
 from visloc.features.networks.r2d2.architecture import FAST_R2D2, R2D2, Architecture
 from visloc.features.networks.r2d2.model import normalized
@@ -22,6 +19,9 @@ from visloc.features.networks.r2d2.model import read_network as read_r2d2
 from visloc.features.networks.xfeat import extractor as xfeat
 from visloc.features.networks.xfeat.load import weights_path as xfeat_path
 from visloc.features.networks.xfeat.model import read_network as read_xfeat
+from visloc_extensions.descriptors.convvlad import NUM_BLOCKS
+from visloc_extensions.descriptors.efficientnet import load as efficientnet
+from visloc_extensions.descriptors.efficientnet.model import read_network as read_efficientnet
 
 
 @dataclass(frozen=True, slots=True, eq=False)

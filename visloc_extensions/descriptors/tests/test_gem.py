@@ -16,18 +16,18 @@ from torch import Tensor
 
 from visloc.errors import WeightsError
 from visloc.features.backends.torch import shapes_of
-from visloc.features.descriptors.convvlad import load_convvlad
-from visloc.features.descriptors.gem import load_gem
-from visloc.features.descriptors.pooling import generalized_mean
-from visloc.features.networks.efficientnet import load as efficientnet
-from visloc.features.networks.efficientnet.load import network_input, weights_path
-from visloc.features.networks.efficientnet.model import (
+from visloc.features.weights.checkpoint import Checkpoint, read_checkpoint
+from visloc.types import LocalFeatures
+from visloc_extensions.descriptors.convvlad import load_convvlad
+from visloc_extensions.descriptors.efficientnet import load as efficientnet
+from visloc_extensions.descriptors.efficientnet.load import network_input, weights_path
+from visloc_extensions.descriptors.efficientnet.model import (
     EfficientNetLite0,
     TorchNetwork,
     read_network,
 )
-from visloc.features.weights.checkpoint import Checkpoint, read_checkpoint
-from visloc.types import LocalFeatures
+from visloc_extensions.descriptors.gem import load_gem
+from visloc_extensions.descriptors.pooling import generalized_mean
 
 FILE = "efficientnet-lite0-57934424.pth"
 NO_FEATURES = LocalFeatures(

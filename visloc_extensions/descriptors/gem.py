@@ -14,15 +14,15 @@ from numpy.typing import NDArray
 
 from visloc.features.base import Fingerprint, GlobalDescriptor
 from visloc.features.descriptors.image_descriptor import ImageDescriptor
-from visloc.features.descriptors.pooling import generalized_mean
 from visloc.features.descriptors.whitening import WHITENING_PARAMETERS
-from visloc.features.networks.efficientnet.load import (
+from visloc.options import Inference
+from visloc_extensions.descriptors.efficientnet.load import (
     MAX_LONG_SIDE_PX,
     Network,
     make_network,
     network_input,
 )
-from visloc.options import Inference
+from visloc_extensions.descriptors.pooling import generalized_mean
 
 EXPONENT = 3.0  # with which the paper's networks start, and end near
 

@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from visloc.features.base import Fingerprint, GlobalDescriptor
 from visloc.features.descriptors.vlad import VLAD_PARAMETERS, VladDescriptor
 from visloc.features.descriptors.whitening import unit_rows
-from visloc.features.networks.efficientnet.load import (
+from visloc.options import Inference
+from visloc.types import LocalFeatures
+from visloc_extensions.descriptors.efficientnet.load import (
     MAX_LONG_SIDE_PX,
     Network,
     make_network,
     network_input,
 )
-from visloc.options import Inference
-from visloc.types import LocalFeatures
 
 # After the stem, all blocks before the last halving of the resolution: 112 channels.
 NUM_BLOCKS = 11

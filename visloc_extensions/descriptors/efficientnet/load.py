@@ -53,7 +53,7 @@ def make_network(
     graph = open_graph(feature, sha256, weights_dir, inference, threads)
     if graph is not None:
         return OpenVinoNetwork(graph), sha256
-    from visloc.features.networks.efficientnet.model import TorchNetwork, read_network
+    from visloc_extensions.descriptors.efficientnet.model import TorchNetwork, read_network
 
     network, sha256 = read_network(path)
     return TorchNetwork(network, num_blocks), sha256
