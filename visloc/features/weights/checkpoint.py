@@ -104,8 +104,9 @@ def read_checkpoint(
             return Checkpoint(path, found_sha256, _read_safetensors(data))
         return Checkpoint(path, found_sha256, *_read_torch_file(data))
     except _MALFORMED as error:
-        # The first line says what is wrong, and torch's others how to switch the checks off.
-        reason = str(error).strip().partition("\n")[0]
+        # torch's long message also says how to switch its checks off.
+        _, _, refused = str(error).rpartition("WeightsUnpickler error: ")
+        reason = refused.strip().partition("\n")[0].partition(" Please use ")[0]
         raise refuse(
             "weights.format", field=str(path), got=f"{type(error).__name__}: {reason}"
         ) from error

@@ -13,9 +13,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from visloc.archive import sha256_of
 from visloc.errors import WeightsError
 from visloc.features import make_global_descriptor
-from visloc.features.weights.checkpoint import read_checkpoint
 from visloc.types import LocalFeatures
 from visloc_extensions.descriptors.apgem import PCA_NAME, PUBLISHED, ApGem, load_apgem, whitened
 from visloc_extensions.descriptors.network_descriptor import NetworkDescriptor
@@ -217,7 +217,7 @@ def test_fingerprint_holds_what_shapes_the_vector(apgem: ApGem, weights_dir: Pat
         "pca": "Landmarks_clean",
         "pca_whitening_power": 0.25,
     }
-    assert fingerprint.weights_sha256 == read_checkpoint(weights_dir / PUBLISHED.file_name).sha256
+    assert fingerprint.weights_sha256 == sha256_of(weights_dir / PUBLISHED.file_name)
 
 
 def _hollow(tmp_path: Path, **changes: Tensor | None) -> Path:

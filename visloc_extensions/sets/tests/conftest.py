@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from tests.mapping.conftest import walk  # noqa: F401
+from tests.mapping.conftest import build_walk, walk  # noqa: F401
 from tests.mapping.own_test.test_verdict import broken  # noqa: F401
 from tests.mapping.pipeline.test_retrieval_only import bare  # noqa: F401
 from tests.service.conftest import in_study, serve, study, two_rooms  # noqa: F401
