@@ -10,7 +10,7 @@ PAGE_SOURCES := $(shell find web/src web/client/src web/*.html web/*.json web/cl
 .DEFAULT_GOAL := help
 # Vite needs this much; without it the service has no page, and says so.
 NODE_IS_THERE = command -v npm >/dev/null && node -e 'const [a, b] = process.versions.node.split(".").map(Number); process.exit(a > 22 || (a === 22 && b >= 12) || (a === 20 && b >= 19) ? 0 : 1)'
-.PHONY: help install apart size licences-check page check-page browser balancer promtool demo test test-core test-extensions test-slow docs-check docs-errors docs-options licences lock sbom audit fuzz fuzz-api train-smoke bench bench-gpu bench-change results trust fmt lint types contracts proto proto-check site docs-links check serve clean
+.PHONY: help install apart size licences-check page check-page browser balancer promtool demo test test-core test-extensions test-slow docs-check docs-errors docs-options licences lock sbom audit fuzz fuzz-api train-smoke bench bench-gpu bench-scale bench-change results trust fmt lint types contracts proto proto-check site docs-links check serve clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "%-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -144,6 +144,9 @@ bench: install ## seconds and accuracy beside the peer and the machine's limit, 
 bench-gpu: install ## networks, queries and a service on a CUDA GPU, of DATASET
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.speed.gpu $(or $(DATASET),../shared/data/redkitchen) \
 		--weights-dir $(or $(WEIGHTS),../shared/weights) $(ARGS)
+
+bench-scale: install ## maps of 100 to 100 000 images: opening, memory, retrieval
+	$(BIN)/python -m benchmarks.scale $(ARGS)
 
 bench-change: install ## other light, weather and cameras: where photos are lost, as in docs/change.md
 	$(BIN)/python -m benchmarks.change $(ARGS)
