@@ -104,9 +104,9 @@ def read_checkpoint(
             return Checkpoint(path, found_sha256, _read_safetensors(data))
         return Checkpoint(path, found_sha256, *_read_torch_file(data))
     except _MALFORMED as error:
-        # torch's long message also says how to switch its checks off.
-        _, _, refused = str(error).rpartition("WeightsUnpickler error: ")
-        reason = refused.strip().partition("\n")[0].partition(" Please use ")[0]
+        # Around what is wrong, torch says how to switch its checks off.
+        is_torchs = isinstance(error, pickle.UnpicklingError) and error.__context__ is not None
+        reason = str(error.__context__ if is_torchs else error).partition(" Please use ")[0]
         raise refuse(
             "weights.format", field=str(path), got=f"{type(error).__name__}: {reason}"
         ) from error

@@ -114,6 +114,8 @@ def test_code_in_a_file_is_refused_and_not_run(
     with pytest.raises(WeightsError, match="does not hold complete, plain tensors") as caught:
         read_checkpoint(path)
     assert caught.value.code == "weights.format"
+    assert "can still be loaded" not in str(caught.value)
+    assert "Unsupported" in str(caught.value) or "unsupported" in str(caught.value)
     assert not witness.exists()
 
 
