@@ -55,6 +55,9 @@ _ROTATION_DEG, _DIRECTION_DEG = 5.0, 75.0
 # Few matches of a wall fit many relative poses. They contradict poses only if less than this part
 # of them fits, to this share of the longer side (``mapping.methods.sparse.pair_agreement``).
 _LEAST_FITTING, _ABOUT = 0.4, 0.01
+# Around closed ways of pairs, rotations add up to less than this if the photos overlap. What photos
+# of a repeating floor have in common tells of rotations that have nothing to do with one another.
+_CLOSED_DEG = 15.0
 # Depth that fits the poses to less than this share is right. Kinect's is 1 to 2 % off.
 _DEPTH_OFF = 0.05
 # Only pairs whose relative pose is the given one to within this rotation tell of depth.
@@ -220,6 +223,7 @@ def _doubt_about_poses(
     if not is_named and (
         (rotation_deg <= _ROTATION_DEG and direction_deg <= _DIRECTION_DEG)
         or _median([_fitting(given, pair) for pair in pairs], pairs) >= _LEAST_FITTING
+        or not _agree_with_each_other(pairs)
     ):
         return None
     advice = (
@@ -272,6 +276,32 @@ def _disagreement(poses: Sequence[Pose], pairs: Sequence[_Pair]) -> tuple[float,
     least = np.median(errors[clear, 2])
     far = [row for row in clear if errors[row, 2] >= least]
     return rotation_deg, _median(errors[far, 1], [pairs[row] for row in far])
+
+
+def _agree_with_each_other(pairs: Sequence[_Pair]) -> bool:
+    """Tell whether rotations add up around closed ways of pairs; so they do where there are none.
+
+    Pairs of most matches come first. Those that join no photos close a way.
+    """
+    rotations: dict[int, NDArray[np.float64]] = {}  # of each photo, in the frame of its group
+    groups: dict[int, list[int]] = {}
+    errors_deg, closing = [], []
+    for pair in sorted(pairs, key=lambda each: -len(each.rays[0])):
+        for row in (pair.first, pair.second):
+            rotations.setdefault(row, np.eye(3))
+            groups.setdefault(row, [row])
+        second = pair.b_from_a.rotation @ rotations[pair.first]
+        correction = rotations[pair.second].T @ second
+        first_group, second_group = groups[pair.first], groups[pair.second]
+        if first_group is second_group:
+            errors_deg.append(math.degrees(rotation_angle(correction)))
+            closing.append(pair)
+            continue
+        for row in second_group:
+            rotations[row] = rotations[row] @ correction
+            groups[row] = first_group
+        first_group.extend(second_group)
+    return not closing or _median(errors_deg, closing) <= _CLOSED_DEG
 
 
 def _median(values: ArrayLike, pairs: Sequence[_Pair]) -> float:

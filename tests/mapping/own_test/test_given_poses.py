@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from mapping.own_test import given_poses
 from mapping.own_test.given_poses import _distances, _factor, _is_along_ray, _Pair, _Written
@@ -68,12 +69,21 @@ def pairs_of(poses: list[Pose]) -> list[_Pair]:
     return pairs
 
 
-def doubt_about(written: list[Pose]) -> Doubt | None:
+def look_alikes(pairs: list[_Pair]) -> list[_Pair]:
+    """Pairs whose matches fit rotations that have nothing to do with one another."""
+    random = Rotation.random(len(pairs), np.random.default_rng(0)).as_matrix()
+    return [
+        replace(pair, b_from_a=Pose(rotation, pair.b_from_a.translation))
+        for pair, rotation in zip(pairs, random, strict=True)
+    ]
+
+
+def doubt_about(written: list[Pose], pairs: list[_Pair] | None = None) -> Doubt | None:
     photos = [photo(row, pose) for row, pose in enumerate(written)]
     of_devices = [
         _Written("camera", row, Pose.identity(), pose) for row, pose in enumerate(written)
     ]
-    return given_poses._doubt_about_poses(photos, of_devices, pairs_of(TRUE))
+    return given_poses._doubt_about_poses(photos, of_devices, pairs or pairs_of(TRUE))
 
 
 @pytest.mark.parametrize(
@@ -119,6 +129,22 @@ def test_poses_of_other_photos_are_in_doubt_without_a_name() -> None:
 
     assert doubt is not None
     assert "No usual convention" in doubt.message
+
+
+def test_photos_that_only_look_alike_say_nothing_of_poses() -> None:
+    order = np.random.default_rng(0).permutation(len(TRUE))
+    apart = [TRUE[row] for row in order]  # no match fits these
+
+    assert doubt_about(apart, look_alikes(pairs_of(TRUE))) is None
+
+
+def test_photos_of_which_a_third_look_alike_contradict_wrong_poses() -> None:
+    pairs = pairs_of(TRUE)
+    third = {id(pair) for pair in pairs[::3]}
+    mixed = [pair for pair in pairs if id(pair) not in third] + look_alikes(pairs[::3])
+    order = np.random.default_rng(0).permutation(len(TRUE))
+
+    assert doubt_about([TRUE[row] for row in order], mixed) is not None
 
 
 def test_distances_are_those_of_exact_rays() -> None:
