@@ -27,7 +27,7 @@ PACKAGE = "visloc_extensions"
 APART = ROOT / ".apart"
 TREE = APART / "tree"
 # Built and installed things, which git does not know: links to those of the checkout.
-LINKED = (".venv", "web/node_modules", "service/page/built")
+LINKED = (".venv", "web/node_modules", "web/client/dist", "service/page/built")
 # Its commands and links are those of the core and the extensions.
 OF_THE_WHOLE = "tests/test_docs.py"
 CHECKS = "lint types contracts licences-check proto-check site size"
@@ -96,7 +96,7 @@ def check(only: str | None) -> bool:
         # The environment is that of the checkout, and is not to be made again.
         commands.append(("make", "--old-file=.venv/.installed", *CHECKS.split()))
     if only != "checks":
-        tests = ("tests", f"--ignore={OF_THE_WHOLE}", "--max-worker-restart", "1")
+        tests = ("tests", f"--deselect={OF_THE_WHOLE}", "--max-worker-restart", "1")
         commands.append((sys.executable, "-m", "pytest", *PYTEST, *tests))
     return all(
         subprocess.run(command, cwd=TREE, env=environment, check=False).returncode == 0

@@ -18,7 +18,6 @@ from mapping.sample import write_sample
 from visloc.archive import MapStore
 from visloc.geometry import PixelOrigin, Similarity
 from visloc.kapture import Dataset, FileRecord, read_dataset, write_dataset
-from visloc_extensions.sets.publishing import publish_set
 
 SAMPLE, FLOORS = "sample", "floors"
 # The videos of floors 10 and 13 by the map that half of their photos make.
@@ -105,6 +104,8 @@ def make_missing(places: Places, needed: set[str], tell: Callable[[str], None]) 
             made = BuildSettings(dataset, map_id, maps_dir=places.maps, workers=2, accept=True)
             build_map(replace(made, **settings), lambda *_: None)
     if FLOORS in needed - there:
+        from visloc_extensions.sets.publishing import publish_set  # only for this
+
         tell(f"making the set {FLOORS}")
         # Videos without poses may have become several maps.
         refs = [

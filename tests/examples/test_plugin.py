@@ -50,7 +50,8 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def python(installed: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    environment = os.environ | {"PYTHONPATH": str(installed), "COLUMNS": "200"}
+    paths = os.pathsep.join([str(installed), *sys.path])
+    environment = os.environ | {"PYTHONPATH": paths, "COLUMNS": "200"}
     return subprocess.run(
         [sys.executable, *arguments], env=environment, capture_output=True, text=True, timeout=100
     )

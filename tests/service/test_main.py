@@ -130,9 +130,11 @@ def test_maps_at_a_url_are_refused_without_the_extension(monkeypatch: pytest.Mon
         Server(ServiceSettings(maps_dir="s3://bucket/maps", http_port=0, grpc_port=0))
 
 
-def test_answers_on_a_connection_that_is_kept_do_not_wait_for_acknowledgements() -> None:
+def test_answers_on_a_connection_that_is_kept_do_not_wait_for_acknowledgements(
+    tmp_path: Path,
+) -> None:
     with (
-        _listen("127.0.0.1", 0) as listener,
+        _listen(ServiceSettings(maps_dir=tmp_path), 0) as listener,
         socket.create_connection(listener.getsockname()),
         listener.accept()[0] as accepted,
     ):

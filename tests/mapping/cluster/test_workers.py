@@ -112,7 +112,7 @@ def run_build(walk: Path, tmp_path: Path) -> Callable[[str], subprocess.Complete
             cwd=tmp_path,
             env={
                 **{name: value for name, value in os.environ.items() if "VISLOC" not in name},
-                "PYTHONPATH": str(Path(__file__).resolve().parents[3]),
+                "PYTHONPATH": os.pathsep.join(sys.path),
             },
         )
 

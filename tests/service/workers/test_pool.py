@@ -137,7 +137,7 @@ def opens(vision: Vision) -> None:
 
     def slow(_: object) -> Any:
         time.sleep(0.5)
-        return SimpleNamespace(map=SimpleNamespace(size_bytes=1))
+        return SimpleNamespace(size_bytes=1)  # like what a set opens
 
     vision._maps._open = slow  # type: ignore[method-assign]
     vision.load(MapFolder("hall@1", Path("hall")))

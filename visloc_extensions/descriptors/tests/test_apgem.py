@@ -13,13 +13,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from visloc.archive import sha256_of
 from visloc.errors import WeightsError
 from visloc.features import make_global_descriptor
-<<<<<<< HEAD
-=======
 from visloc.features.weights.checkpoint import sha256_of
->>>>>>> 6a43785c (Tell what a weights file names, not torch's advice)
 from visloc.types import LocalFeatures
 from visloc_extensions.descriptors.apgem import PCA_NAME, PUBLISHED, ApGem, load_apgem, whitened
 from visloc_extensions.descriptors.network_descriptor import NetworkDescriptor
