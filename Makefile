@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
+DEVELOPED := $(VENV)/.developed
+EXTRAS := mapping,service,gem,s3,clients,compare,ros
 # What is made last of it.
 PAGE := service/page/built/report/report.js
 PAGE_SOURCES := $(shell find web/src web/client/src web/*.html web/*.json web/client/*.json web/*.ts -type f)
@@ -10,20 +12,22 @@ PAGE_SOURCES := $(shell find web/src web/client/src web/*.html web/*.json web/cl
 .DEFAULT_GOAL := help
 # Vite needs this much; without it the service has no page, and says so.
 NODE_IS_THERE = command -v npm >/dev/null && node -e 'const [a, b] = process.versions.node.split(".").map(Number); process.exit(a > 22 || (a === 22 && b >= 12) || (a === 20 && b >= 19) ? 0 : 1)'
-.PHONY: help install apart size licences-check page check-page browser balancer promtool demo test test-core test-extensions test-slow docs-check docs-errors docs-options licences lock sbom audit fuzz fuzz-api train-smoke bench bench-gpu bench-scale bench-change results trust fmt lint types contracts proto proto-check site docs-links check serve clean
+.PHONY: help install develop apart size licences-check page check-page browser balancer promtool demo test test-core test-extensions test-slow docs-check docs-errors docs-options licences lock sbom audit fuzz fuzz-api train-smoke bench bench-gpu bench-scale bench-change results trust fmt lint types contracts proto proto-check site docs-links check serve clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "%-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-install: $(INSTALLED) page ## make .venv with every extra, and the page where Node.js is
+install: $(INSTALLED) page ## make .venv to build, serve and localize, and the page where Node.js is
 
-$(INSTALLED): pyproject.toml constraints.txt hatch_build.py $(wildcard visloc/matching/native/*.[ch])
+develop: $(DEVELOPED) page ## the same with what tests, checks and the docs need
+
+$(DEVELOPED): EXTRAS := $(EXTRAS),cluster,tracing,dev
+$(INSTALLED) $(DEVELOPED): pyproject.toml constraints.txt hatch_build.py $(wildcard visloc/matching/native/*.[ch])
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "visloc needs Python 3.11 or newer")'
 	$(PYTHON) -m venv $(VENV)
-	@echo 'Installing everything into $(VENV): about 3.5 GB, and five minutes in which nothing is printed.' >&2
-	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt \
-		--editable '.[mapping,service,gem,s3,cluster,tracing,clients,compare,ros,dev]'
-	touch $(INSTALLED)
+	@echo 'Installing into $(VENV): some minutes in which nothing is printed.' >&2
+	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[$(EXTRAS)]'
+	touch $(INSTALLED) $@
 
 page: ## build the page from web/
 	@if $(NODE_IS_THERE); then $(MAKE) --no-print-directory $(PAGE); \
@@ -75,41 +79,41 @@ demo: install ## the main job on a synthetic sample: build, serve, localize, pic
 
 test: test-core test-extensions ## the tests, in about twelve minutes on two cores
 
-test-core: install browser balancer promtool ## the core's tests, in a copy without extensions
+test-core: develop browser balancer promtool ## the core's tests, in a copy without extensions
 	$(BIN)/python -m tools.apart --all --only tests
 
-test-extensions: install ## the tests of the extensions, and of what the docs say
+test-extensions: develop ## the tests of the extensions, and of what the docs say
 	$(BIN)/pytest -m 'not slow' --numprocesses 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 1 \
 		visloc_extensions tests/test_docs.py
 
-test-slow: install browser balancer promtool ## the slow tests
+test-slow: develop browser balancer promtool ## the slow tests
 	$(BIN)/pytest -m slow
 
-apart: install ## the core's checks and tests without each extension in turn: NAMES
+apart: develop ## the core's checks and tests without each extension in turn: NAMES
 	$(BIN)/python -m tools.apart $(NAMES) $(ARGS)
 
-size: install ## lines by room of the core and by extension, against pyproject.toml
+size: develop ## lines by room of the core and by extension, against pyproject.toml
 	$(BIN)/python -m tools.size
 
-docs-check: install ## run the commands that the docs print, or parse those that take hours: PAGES
+docs-check: develop ## run the commands that the docs print, or parse those that take hours: PAGES
 	$(BIN)/python -m tests.docs_check $(PAGES)
 
-site: install ## write the documentation as a site to .site, with warnings as errors
+site: develop ## write the documentation as a site to .site, with warnings as errors
 	PYTHONPATH=. $(BIN)/sphinx-build --quiet --fail-on-warning --keep-going -c tools/site . .site
 
-docs-links: install ## ask the hosts that the documentation links to
+docs-links: develop ## ask the hosts that the documentation links to
 	PYTHONPATH=. $(BIN)/sphinx-build --quiet -b linkcheck -c tools/site . .site-links
 
-docs-errors: install ## write the tables of error codes from visloc/error_codes.toml
+docs-errors: develop ## write the tables of error codes from visloc/error_codes.toml
 	$(BIN)/python -m tests.error_docs
 
-docs-options: install ## write the table of options from visloc/options.py
+docs-options: develop ## write the table of options from visloc/options.py
 	$(BIN)/python -m tests.option_docs
 
-licences: install ## write docs/licences.md, and check it against tools/supply_chain/policy.toml
+licences: develop ## write docs/licences.md, and check it against tools/supply_chain/policy.toml
 	$(BIN)/python -m tools.supply_chain.licences --write
 
-lock: install ## write docker/locks from constraints.txt, with the hashes of the package index
+lock: develop ## write docker/locks from constraints.txt, with the hashes of the package index
 	$(BIN)/python -m tools.supply_chain.lock
 
 # What an image holds: its lock, and torch, which no lock has.
@@ -117,61 +121,61 @@ define held_by
 { cat docker/locks/$$image.txt; test $$image = clients || grep '^torch==' constraints.txt; }
 endef
 
-sbom: install ## write .sbom/IMAGE.cdx.json (CycloneDX): what each image holds
+sbom: develop ## write .sbom/IMAGE.cdx.json (CycloneDX): what each image holds
 	mkdir -p .sbom
 	for image in service mapping clients; do $(held_by) | PYTHONWARNINGS=ignore $(BIN)/cyclonedx-py \
 		requirements --pyproject pyproject.toml --output-reproducible --output-file .sbom/$$image.cdx.json - \
 		|| exit 1; done
 
-audit: install ## known vulnerabilities of what the images hold; fails too where PyPI does not tell
+audit: develop ## known vulnerabilities of what the images hold; fails too where PyPI does not tell
 	mkdir -p .sbom
 	for image in service mapping clients; do $(held_by) | sed 's/ --hash.*//' > .sbom/$$image.txt; \
 		$(BIN)/pip-audit --strict --no-deps --disable-pip --requirement .sbom/$$image.txt || exit 1; done
 
-fuzz: install ## fuzz what reads strangers' bytes: RUNS inputs for each target
+fuzz: develop ## fuzz what reads strangers' bytes: RUNS inputs for each target
 	$(BIN)/python -m tests.fuzz --runs $(or $(RUNS),100000)
 
-fuzz-api: install ## send CASES requests made from our OpenAPI
+fuzz-api: develop ## send CASES requests made from our OpenAPI
 	$(BIN)/python -m tests.fuzz.api --cases $(or $(CASES),5000)
 
-train-smoke: install ## train 20 steps on the sample: the loss falls
+train-smoke: develop ## train 20 steps on the sample: the loss falls
 	$(BIN)/pytest visloc_extensions/training/tests/test_training_run.py -k twenty_steps
 
-bench: install ## seconds and accuracy beside the peer and the machine's limit, of DATASET with FEATURES
+bench: develop ## seconds and accuracy beside the peer and the machine's limit, of DATASET with FEATURES
 	$(BIN)/python -m benchmarks.speed $(or $(DATASET),../shared/data/redkitchen) \
 		--local-features $(or $(FEATURES),faster2d2) --weights-dir $(or $(WEIGHTS),../shared/weights) $(ARGS)
 
-bench-gpu: install ## networks, queries and a service on a CUDA GPU, of DATASET
+bench-gpu: develop ## networks, queries and a service on a CUDA GPU, of DATASET
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.speed.gpu $(or $(DATASET),../shared/data/redkitchen) \
 		--weights-dir $(or $(WEIGHTS),../shared/weights) $(ARGS)
 
-bench-scale: install ## maps of 100 to 100 000 images: opening, memory, retrieval
+bench-scale: develop ## maps of 100 to 100 000 images: opening, memory, retrieval
 	$(BIN)/python -m benchmarks.scale $(ARGS)
 
-bench-change: install ## other light, weather and cameras: where photos are lost, as in docs/change.md
+bench-change: develop ## other light, weather and cameras: where photos are lost, as in docs/change.md
 	$(BIN)/python -m benchmarks.change $(ARGS)
 
-results: install ## measure tables of docs/results.md, or ONLY these, and stamp them; goes on where it stopped
+results: develop ## measure tables of docs/results.md, or ONLY these, and stamp them; goes on where it stopped
 	nice -n 5 $(BIN)/python -m benchmarks.results $(ONLY) $(ARGS)
 
-trust: install ## how far an answer can be trusted: every figure of docs/trust.md
+trust: develop ## how far an answer can be trusted: every figure of docs/trust.md
 	$(BIN)/python -m benchmarks.trust $(ARGS)
 
-fmt: install ## format the code
+fmt: develop ## format the code
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-lint: install ## ruff
+lint: develop ## ruff
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-types: install ## mypy, strict
+types: develop ## mypy, strict
 	$(BIN)/mypy
 
-contracts: install ## who may import whom
+contracts: develop ## who may import whom
 	$(BIN)/lint-imports
 
-proto: install ## generate visloc_api from proto/
+proto: develop ## generate visloc_api from proto/
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m grpc_tools.protoc --proto_path=proto --python_out=. --grpc_python_out=. \
 		--mypy_out=. --mypy_grpc_out=. proto/visloc_api/v1/localization.proto
 
@@ -183,7 +187,7 @@ check-page: page ## types, format and unit tests of web/
 	@if $(NODE_IS_THERE); then npm run --prefix web --silent check; \
 	else echo 'The page is not checked: there is no Node.js.' >&2; fi
 
-licences-check: install ## dependencies have licences that the policy allows
+licences-check: develop ## dependencies have licences that the policy allows
 	$(BIN)/python -m tools.supply_chain.licences
 
 check: lint types contracts size licences-check proto-check check-page site ## what must be green before review

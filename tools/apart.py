@@ -94,7 +94,7 @@ def check(only: str | None) -> bool:
     commands: list[Sequence[str]] = []
     if only != "tests":
         # The environment is that of the checkout, and is not to be made again.
-        commands.append(("make", "--old-file=.venv/.installed", *CHECKS.split()))
+        commands.append(("make", "--old-file=.venv/.developed", *CHECKS.split()))
     if only != "checks":
         tests = ("tests", f"--deselect={OF_THE_WHOLE}", "--max-worker-restart", "1")
         commands.append((sys.executable, "-m", "pytest", *PYTEST, *tests))
