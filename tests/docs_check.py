@@ -462,7 +462,8 @@ def asks_server(command: Command) -> bool:
 def environment() -> dict[str, str]:
     """Return the environment of a reader who has activated ``.venv`` in the repository."""
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    return {**os.environ, "PATH": path, "PYTHONPATH": str(ROOT), "COLUMNS": "120"}
+    paths = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
+    return {**os.environ, "PATH": path, "PYTHONPATH": paths, "COLUMNS": "120"}
 
 
 def call(folder: Path, words: Sequence[str]) -> str:

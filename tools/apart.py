@@ -27,7 +27,8 @@ PACKAGE = "visloc_extensions"
 APART = ROOT / ".apart"
 TREE = APART / "tree"
 # Built and installed things, which git does not know: links to those of the checkout.
-LINKED = (".venv", "web/node_modules", "web/client/dist", "service/page/built")
+LINKED = (".venv", "web/node_modules", "service/page/built")
+COPIED = "web/client/dist"  # npm packs no links
 # Its commands and links are those of the core and the extensions.
 OF_THE_WHOLE = "tests/test_docs.py"
 CHECKS = "lint types contracts licences-check proto-check site size"
@@ -64,6 +65,8 @@ def copy_without(gone: Iterable[str]) -> None:
         if (ROOT / name).exists():
             (TREE / name).parent.mkdir(parents=True, exist_ok=True)
             (TREE / name).symlink_to((ROOT / name).resolve())
+    if (ROOT / COPIED).exists():
+        shutil.copytree(ROOT / COPIED, TREE / COPIED)
     for file in ROOT.glob(NATIVE):
         shutil.copy2(file, TREE / file.relative_to(ROOT))
     if (shared := ROOT.parent / "shared").is_dir():
