@@ -157,6 +157,7 @@ RULES = (
     Rule(Tier.PARSED, r"", r"([A-Z]+=\S+ |[A-Z]+=\".*\" )?make ", "a target of its own"),
     Rule(Tier.PARSED, r"examples/plugin", r"", "needs it installed; tests/examples/test_plugin.py"),
     Rule(Tier.PARSED, r"visloc_extensions/scans", r"", "needs a scan of a phone; its tests"),
+    Rule(Tier.PARSED, r"extensions/graphs", r"mapping export-graph", "needs weights; its tests"),
     Rule(Tier.PARSED, r"extensions/sets", r"mapping (set|split)", _PLACES),
     Rule(Tier.PARSED, r"capture/README", r"mapping capture", "the tutorial runs it"),
     Rule(Tier.PARSED, r"your-app", r"visloc-service .*cors", "test_web_overlay.py"),

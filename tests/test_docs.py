@@ -227,7 +227,8 @@ def test_the_example_that_reads_points_sees_the_map(built_maps: Path, desk: Desk
         if page.parent.name != "tutorials"
         and not re.match(
             r"make|\.venv/bin/(visloc-service|pip |"
-            r"mapping (build|capture|anchor|edit|set|split|prune|merge|update|upgrade|pack))"
+            r"mapping (build|capture|anchor|edit|set|split|prune|merge|update|upgrade|pack"
+            r"|export-graph))"
             r"|.*/mapping import .* --map|.* --features-dir|.*/localize maps push"
             r"|.*/localize bag |.*/mapping import rosbag|.* --map with-sift"
             r"|.* https://maps\.example\.org",

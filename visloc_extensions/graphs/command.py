@@ -19,8 +19,6 @@ def export_graph(
         typer.Option(
             "--weights-dir",
             envvar="VISLOC_WEIGHTS_DIR",
-            exists=True,
-            file_okay=False,
             help="Folder of network weights, to which the graph is added.",
         ),
     ],
