@@ -77,7 +77,7 @@ promtool:
 demo: install ## the main job on a synthetic sample: build, serve, localize, picture
 	$(BIN)/python examples/demo.py
 
-test: test-core test-extensions ## the tests, in about twelve minutes on two cores
+test: test-core test-extensions ## the tests, in about half an hour on two cores
 
 test-core: develop browser balancer promtool ## the core's tests, in a copy without extensions
 	$(BIN)/python -m tools.apart --all --only tests

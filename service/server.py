@@ -184,7 +184,7 @@ class _HttpServer(uvicorn.Server):
         certificate: Certificate | None,
     ) -> None:
         class LimitedProtocol(H11Protocol):
-            def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+            def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as uvicorn
                 super().connection_made(transport)
                 if len(self.connections) > max_connections:
                     transport.abort()

@@ -15,7 +15,7 @@ from visloc.priors import NO_PRIORS, Priors
 
 
 class SequenceSearch(Protocol):
-    """Where a sequence is localized. Instants to check and to add come in order."""
+    """Localizes a sequence; its instants are checked and added in order."""
 
     async def check(self, first: int, instants: Sequence[InstantJob]) -> None:
         """Refuse instants, the first of this index, that cannot be solved, before any work."""

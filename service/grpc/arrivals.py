@@ -19,7 +19,7 @@ from visloc.errors import InvalidInput, Overloaded, TimedOut
 _LARGE_MESSAGES = ("Localize", "LocalizeRig")
 
 
-class TimelyCalls(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
+class TimelyCalls(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]  # generic in the stubs only
     """Ends calls whose messages do not come or cannot be parsed.
 
     Args:

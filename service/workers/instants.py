@@ -229,7 +229,7 @@ class DecodedQuery:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tools:
-    """What a worker process lends to the tasks of extensions.
+    """The parts of a worker process that tasks of extensions use.
 
     Attributes:
         decode: ``decode`` with the limits of the process.

@@ -28,7 +28,7 @@ logger = logging.getLogger(__name__)
 
 
 class OpenSet(Protocol):
-    """What an extension opens under a map id; its other methods are tasks (``Vision.in_set``)."""
+    """An object that an extension opens for a map id; ``Vision.in_set`` calls its other methods."""
 
     @property
     def size_bytes(self) -> int: ...
